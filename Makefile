@@ -1,0 +1,38 @@
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.DEFAULT_GOAL := help
+.PHONY: help setup run test test-all lint ui clean
+
+help:  ## show this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+$(VENV)/.installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@
+
+setup: $(VENV)/.installed  ## create .venv and install everything
+
+run: setup  ## random baseline, both networks trained and evaluated on the CPU, the report's table
+	$(BIN)/python -m atlantis_exp baseline evaluation=quick
+	$(BIN)/python -m atlantis_exp -m experiment=quick model=cnn,resnet
+	$(BIN)/python -m atlantis_exp report
+
+test: lint  ## lint, types and the quick tests
+	$(BIN)/python -m pytest -q
+
+test-all: lint  ## every test, the slow ones too
+	$(BIN)/python -m pytest -q -m ''
+
+lint: setup  ## ruff and mypy --strict
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+ui: setup  ## the MLflow UI on the local store
+	$(BIN)/python -m atlantis_exp ui
+
+clean:  ## remove .venv and caches (never outputs/)
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,1 @@
+"""Which network plays Atari Atlantis better on this machine, and how sure are we."""

@@ -1,0 +1,244 @@
+"""The composition root: a checked config enters, a trainer or an evaluation made of built parts leaves."""
+
+import dataclasses
+import os
+import zlib
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import safetensors.torch
+import torch
+from torch import nn
+
+from atlantis_exp import config as cfg
+from atlantis_exp.faults import Fault
+from atlantis_exp.game.emulator import ACTIONS, Emulator
+from atlantis_exp.game.preprocessing import FrameStack, Preprocessing
+from atlantis_exp.game.vector import Emulators, make_emulators
+from atlantis_exp.learning.learner import Learner
+from atlantis_exp.learning.objectives import DQN, DoubleDQN, Objective
+from atlantis_exp.learning.schedules import ConstantEpsilon, ExponentialEpsilon, LinearEpsilon, Schedule
+from atlantis_exp.networks.cnn import DQNCnn
+from atlantis_exp.networks.dropout import seed_dropout
+from atlantis_exp.networks.resnet import ResNetDQN
+from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.replay.samplers import Sampler, TopHalfSampler, UniformSampler
+from atlantis_exp.tracking.journal import Tracker
+from atlantis_exp.training.actor import Actor, ConstantActor, EpsilonGreedy, RandomActor
+from atlantis_exp.training.checkpoint import Checkpoints
+from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate, replay
+from atlantis_exp.training.progress import Progress
+from atlantis_exp.training.trainer import Cadence, Phase, Plan, Trainer, film_of
+
+# The registry: a schema class of `config` to the class that it configures.
+NETWORKS: dict[type, type[nn.Module]] = {cfg.CnnConfig: DQNCnn, cfg.ResNetConfig: ResNetDQN}
+OBJECTIVES: dict[str, type[Objective]] = {"dqn": DQN, "double_dqn": DoubleDQN}
+SAMPLERS: dict[type, type[Sampler]] = {cfg.UniformConfig: UniformSampler, cfg.TopHalfConfig: TopHalfSampler}
+SCHEDULES: dict[type, type[Schedule]] = {
+    cfg.ExponentialConfig: ExponentialEpsilon,
+    cfg.LinearConfig: LinearEpsilon,
+    cfg.ConstantConfig: ConstantEpsilon,
+}
+OPTIMIZERS: dict[str, type[torch.optim.Optimizer]] = {
+    "adamw": torch.optim.AdamW,
+    "adam": torch.optim.Adam,
+    "rmsprop": torch.optim.RMSprop,
+}
+
+
+def stream(seed: int, name: str) -> np.random.SeedSequence:
+    """The named random stream of a seed; streams of different names are independent."""
+    return np.random.SeedSequence(seed, spawn_key=(zlib.crc32(name.encode()),))
+
+
+def make_emulator(env: cfg.EnvConfig) -> partial[Emulator]:
+    """What makes one emulator, here or in a worker process."""
+    return partial(
+        Emulator,
+        preprocessing=Preprocessing(env.size, env.crop),
+        frameskip=env.frameskip,
+        sticky=env.sticky,
+        max_frames=env.max_frames,
+        max_steps=env.max_steps,
+        noop_max=env.noop_max,
+        max_pool=env.max_pool,
+    )
+
+
+def build_emulators(env: cfg.EnvConfig, num_envs: int) -> Emulators:
+    """`num_envs` emulators, one of them in this process, more in worker processes."""
+    workers = env.workers or len(os.sched_getaffinity(0))
+    return make_emulators(make_emulator(env), num_envs, min(workers, num_envs))
+
+
+def choose_device(name: str) -> torch.device:
+    """The device of that name; `auto` is the GPU where there is one. Raises: ConfigError."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise cfg.ConfigError(f"device={name}: this machine has no CUDA device; valid: auto, cpu")
+    return torch.device(name)
+
+
+def choose_precision(name: str, device: torch.device) -> str:
+    """The precision of that name; `auto` is bf16 where the processor multiplies it natively."""
+    if name != "auto":
+        return name
+    if device.type == "cuda":
+        return "bf16" if torch.cuda.is_bf16_supported() else "fp32"
+    return "bf16" if torch.cpu._is_avx512_bf16_supported() else "fp32"
+
+
+def build_network(model: cfg.CnnConfig | cfg.ResNetConfig, env: cfg.EnvConfig, seed: int, name: str) -> nn.Module:
+    """A network with weights from the named stream; the global generator is as it was."""
+    initial, dropout = stream(seed, name).generate_state(2, np.uint64)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(initial >> np.uint64(1)))
+        network = NETWORKS[type(model)]((env.stack, env.size, env.size), len(ACTIONS))
+    seed_dropout(network, int(dropout >> np.uint64(1)))
+    return network
+
+
+def build_optimizer(optimizer: cfg.AdamConfig | cfg.RmsPropConfig, network: nn.Module) -> torch.optim.Optimizer:
+    """The optimizer of all of a network's parameters."""
+    settings = cfg.to_dict(optimizer)
+    name = settings.pop("name")
+    if isinstance(optimizer, cfg.AdamConfig):
+        settings["betas"] = optimizer.betas
+        settings["fused"] = True
+    else:
+        settings["foreach"] = True
+    return OPTIMIZERS[name](network.parameters(), **settings)
+
+
+def build_learner(config: cfg.Config) -> Learner:
+    """Both networks, the optimizer, the objective."""
+    device = choose_device(config.device)
+    target = config.objective.target
+    network = build_network(config.model, config.env, config.seed, "network").to(device)
+    target_network = build_network(config.model, config.env, config.seed, "target").to(device)
+    if target.start == "copy":
+        target_network.load_state_dict(network.state_dict())
+    return Learner(
+        network,
+        target_network,
+        build_optimizer(config.optimizer, network),
+        OBJECTIVES[config.objective.name](config.objective.gamma),  # type: ignore[call-arg]
+        target.tau,
+        precision=choose_precision(config.training.precision, device),  # type: ignore[arg-type]
+        target_mode=target.mode,
+    )
+
+
+def build_plan(config: cfg.Config) -> Plan:
+    """Phases, schedules and learning cadence."""
+    epsilon = cfg.to_dict(config.epsilon)
+    del epsilon["name"]
+    phases = []
+    for name, phase in config.phase.items():
+        sampler = cfg.to_dict(config.sampler_of(name))
+        del sampler["name"]
+        built = SAMPLERS[type(config.sampler_of(name))](**sampler)
+        phases.append(Phase(name, phase.episodes or phase.steps or 0, phase.lr, built))
+    return Plan(
+        unit="episodes" if next(iter(config.phase.values())).episodes else "steps",
+        phases=phases,
+        epsilon=SCHEDULES[type(config.epsilon)](**epsilon),
+        learn_every=config.training.learn_every,
+        learn_start=config.training.learn_start,
+        batch_size=config.training.batch_size,
+    )
+
+
+def run_evaluation(
+    actor: Actor, env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig, progress: Progress
+) -> tuple[Evaluation, bytes | None]:
+    """Evaluate an actor on emulators of its own; with the film of the best episode where the config asks for it."""
+    played = 0
+
+    def on_episode(episode: Episode) -> None:
+        nonlocal played
+        played += 1
+        progress.evaluated_episode(played, evaluation.episodes, episode)
+
+    with build_emulators(env, min(evaluation.num_envs, evaluation.episodes)) as emulators:
+        result = evaluate(
+            actor,
+            emulators,
+            episodes=evaluation.episodes,
+            epsilon=evaluation.epsilon,
+            seed=evaluation.seed,
+            size=env.size,
+            stack=env.stack,
+            on_episode=on_episode,
+        )
+    if not evaluation.video:
+        return result, None
+    return result, film_of(replay(result.best, make_emulator(env)()), result.best.frames, result.best.steps)
+
+
+def build_network_actor(config: cfg.Config, folder: Path, weights: str, device: str) -> tuple[Actor, int]:
+    """The player that a stored run has trained, from its last commit or its best evaluation, and that step.
+
+    Raises:
+        Fault: where the run has no such weights.
+    """
+    state = Checkpoints(folder / "checkpoints", config.identity()).load()
+    if state is None:
+        raise Fault(f"run {folder.name} has no checkpoint yet")
+    step = int(state["counters"]["steps"])
+    if weights == "best":
+        path = folder / "artifacts" / "best.safetensors"
+        if not path.exists():
+            raise Fault(f"run {folder.name} has no evaluation yet, so no best weights; weights=latest has some")
+        state["learner"]["network"] = safetensors.torch.load_file(path)
+        step = int(state["best_step"])
+    learner = build_learner(dataclasses.replace(config, device=device))
+    learner.load_state_dict(state["learner"])
+    return EpsilonGreedy(learner.q_values, len(ACTIONS)), step
+
+
+def build_baseline(agent: cfg.BaselineAgentConfig) -> Actor:
+    """A player without a network."""
+    return RandomActor(len(ACTIONS)) if agent.name == "random" else ConstantActor(agent.action)
+
+
+def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: Progress) -> Trainer:
+    """All of a run; it writes under `folder` only."""
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    env = config.env
+    learner = build_learner(config)
+    actor = EpsilonGreedy(learner.q_values, len(ACTIONS))
+    evaluation: Callable[[Progress], tuple[Evaluation, bytes | None]] = partial(
+        run_evaluation, actor, env, config.evaluation
+    )
+    return Trainer(
+        plan=build_plan(config),
+        cadence=Cadence(
+            curve_steps=config.tracking.every_steps,
+            histogram_episodes=config.tracking.histogram_episodes,
+            commit_episodes=config.tracking.commit_episodes,
+            commit_seconds=config.tracking.commit_seconds,
+            evaluate_episodes=config.evaluation.every_episodes,
+            evaluate_steps=config.evaluation.every_steps,
+            evaluate_at_end=config.evaluation.at_end,
+        ),
+        emulators=build_emulators(env, env.num_envs),
+        stack=FrameStack(env.num_envs, env.size, env.stack),
+        actor=actor,
+        memory=ReplayMemory(
+            config.replay.capacity, (env.size, env.size), stack=env.stack, budget_bytes=config.replay.max_bytes
+        ),
+        learner=learner,
+        exploration=[np.random.default_rng(child) for child in stream(config.seed, "exploration").spawn(env.num_envs)],
+        sampling=np.random.default_rng(stream(config.seed, "sampling")),
+        seeds=stream(config.seed, "emulators").generate_state(env.num_envs).tolist(),
+        tracker=tracker,
+        checkpoints=Checkpoints(folder / "checkpoints", config.identity()),
+        evaluate=evaluation,
+        progress=progress,
+        max_steps=config.budget.steps,
+    )

@@ -1,0 +1,31 @@
+"""`python -m atlantis_exp evaluate run=NAME epsilon=0.05`: a stored run's network, played again."""
+
+import dataclasses
+from pathlib import Path
+
+from atlantis_exp.commands.app import run_verb
+from atlantis_exp.config import Config, EvaluateConfig, digest, parse, to_dict
+
+
+def evaluate(config: EvaluateConfig) -> None:
+    """Play a stored network on its own environment, print the report's table, and record it beside the run."""
+    from atlantis_exp.build import build_network_actor, run_evaluation
+    from atlantis_exp.commands.runs import RunFolder, find_run, record_evaluation
+    from atlantis_exp.training.progress import Progress
+
+    outputs = Path(config.paths.outputs)
+    run = find_run(outputs, config.run)
+    trained = parse(Config, run.config or {})
+    settings = dataclasses.replace(config.evaluation, episodes=config.episodes, epsilon=config.epsilon)
+    progress = Progress()
+    actor, step = build_network_actor(trained, run.path, config.weights, config.device)
+    progress.say(f"{run.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
+    evaluation, video = run_evaluation(actor, trained.env, settings, progress)
+    facts = {"run": run.name, "step": step, "evaluation": to_dict(settings), "env": to_dict(trained.env)}
+    folder = RunFolder(outputs / "evaluations" / f"{run.name}-at-{step}-{digest(facts)[:6]}")
+    record_evaluation(folder, "evaluation", facts, evaluation, video, config.tracking, outputs)
+
+
+def main() -> None:
+    """Compose and evaluate."""
+    run_verb("evaluate", EvaluateConfig, evaluate)

@@ -1,0 +1,52 @@
+"""`python -m atlantis_exp report`: the results that the outputs folder holds, as a table."""
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from atlantis_exp.commands.app import run_verb
+from atlantis_exp.config import ReportConfig
+
+
+def report(config: ReportConfig) -> None:
+    """Print every run's evaluation, and how to look further."""
+    from atlantis_exp.commands.runs import all_runs
+
+    outputs = Path(config.paths.outputs)
+    runs = all_runs(outputs)
+    if not runs:
+        print(f"there is no run under {outputs / 'runs'} yet")
+        return
+    columns = ("run", "steps", "mean", "+-", "median", "IQM", "high", "low", "random", "episodes")
+    table = Table(*columns, title=f"last evaluations of the runs in {outputs}")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for run in runs:
+        result = run.result
+        if result is None or not result["evaluation"]:
+            table.add_row(run.name, "unfinished" if result is None else f"{result['steps']:,}")
+            continue
+        scores = {
+            key.split("/")[1]: value for key, value in result["evaluation"].items() if key.startswith("evaluation/")
+        }
+        points = ("mean", "standard_error", "median", "interquartile_mean", "high", "low")
+        table.add_row(
+            run.name,
+            f"{result['steps']:,}",
+            *(f"{scores[point]:,.0f}" for point in points),
+            f"{result['evaluation']['actions/random_share']:.1%}",
+            f"{scores['episodes']:.0f}",
+        )
+    console = Console(highlight=False)
+    console = Console(highlight=False, width=max(console.width, 130))
+    console.print(table)
+    for run in runs:
+        if run.result is not None:
+            console.print(f"\n{run.name}\n{run.result['report']}", markup=False)
+    console.print(f"\nthe MLflow UI: make ui (python -m atlantis_exp ui paths.outputs={outputs})", markup=False)
+
+
+def main() -> None:
+    """Compose and print."""
+    run_verb("report", ReportConfig, report)

@@ -1,0 +1,153 @@
+"""`python -m atlantis_exp [train] overrides`: one run; the same command again continues or reports it."""
+
+import shlex
+import signal
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from atlantis_exp.commands.app import run_verb
+from atlantis_exp.config import Config, ConfigError, flatten, to_dict
+from atlantis_exp.faults import Fault
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from atlantis_exp.training.trainer import Trainer
+
+
+class StopRequest:
+    """Turns the first SIGINT, SIGTERM or SIGUSR2 into a flag that the trainer looks at after every step.
+
+    A second SIGINT ends the process at once; what was committed stays.
+    """
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+
+    def __call__(self) -> bool:
+        return self.signal is not None
+
+    @contextmanager
+    def installed(self) -> "Iterator[None]":
+        """Listen while the block runs."""
+        signals = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
+        before = {number: signal.signal(number, self._receive) for number in signals}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _receive(self, number: int, _: FrameType | None) -> None:
+        if self.signal is not None and number == signal.SIGINT:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+            signal.raise_signal(signal.SIGINT)
+        self.signal = number
+
+
+def train(config: Config) -> None:
+    """Start the run that this config is, continue it, or print its result if it has ended."""
+    from atlantis_exp.commands.runs import RunFolder
+
+    outputs = Path(config.paths.outputs)
+    folder = RunFolder(outputs / "runs" / config.run_name())
+    if config.resume == "must" and folder.config is None:
+        raise ConfigError(f"resume=must: there is no run {folder.name} under {outputs / 'runs'}")
+    if config.resume == "never" and folder.config is not None:
+        kept = next(
+            path for n in range(1, 10_000) if not (path := folder.path.with_name(f"{folder.name}~{n}")).exists()
+        )
+        with folder.held():
+            folder.path.rename(kept)
+        print(f"the run that was here is kept as {kept}")
+    if (result := folder.result) is not None and not _goes_on(config, result):
+        print(f"run {folder.name} has ended ({result['outcome']} after {result['steps']:,} steps):\n")
+        print(result["report"])
+        return
+    with folder.held():
+        _train(config, folder)
+
+
+def _goes_on(config: Config, result: dict[str, Any]) -> bool:
+    """Whether a run that ended by its budget has now a larger one."""
+    budget = config.budget.steps
+    return result["outcome"] == "budget" and (budget is None or budget > result["steps"])
+
+
+def _train(config: Config, folder: Any) -> None:
+    from atlantis_exp.build import build_trainer
+    from atlantis_exp.commands.runs import provenance, published
+    from atlantis_exp.game.vector import WorkerDied
+    from atlantis_exp.training.checkpoint import CheckpointError
+    from atlantis_exp.training.progress import Progress
+    from atlantis_exp.training.trainer import Diverged
+
+    progress = Progress()
+    outputs = Path(config.paths.outputs)
+    command = shlex.join(["python", "-m", "atlantis_exp", *sys.argv[1:]])
+    stop = StopRequest()
+    with stop.installed(), published(folder, config.tracking.name, outputs, config.tracking.experiment) as journal:
+        trainer = build_trainer(config, folder.path, journal, progress)
+        try:
+            state = trainer.checkpoints.load(trainer.memory, progress.say)
+            if state is not None:
+                trainer.load_state_dict(state)
+                progress.say(f"continuing run {folder.name} at step {trainer.counters.steps:,}")
+            else:
+                folder.write_config(to_dict(config))
+                journal.params({key: str(value) for key, value in flatten(to_dict(config)).items()})
+                journal.artifact("config.json", (folder.path / "config.json").read_bytes())
+                progress.say(f"starting run {folder.name} in {folder.path}")
+            journal.tags({**provenance(), **_facts(trainer), "atlantis.kind": "training"})
+            journal.status("RUNNING")
+            outcome = trainer.run(stop)
+        except (WorkerDied, CheckpointError, Diverged, OSError) as error:
+            journal.status("FAILED")
+            raise Fault(f"run {folder.name}: {error}; continue with: {command}") from error
+        except BaseException:
+            journal.status("FAILED")
+            raise
+        finally:
+            progress.close()
+            trainer.emulators.close()
+        journal.status("KILLED" if outcome == "interrupted" else "FINISHED")
+    if outcome == "interrupted":
+        assert stop.signal is not None
+        name = signal.Signals(stop.signal).name
+        steps = trainer.counters.steps
+        raise Fault(
+            f"{name}: run {folder.name} is committed at step {steps:,}; continue with: {command}", 128 + stop.signal
+        )
+    report = trainer.last_report or "no evaluation (evaluation.at_end=false)"
+    folder.write_result(
+        {
+            "outcome": outcome,
+            "steps": trainer.counters.steps,
+            "episodes": trainer.counters.episodes,
+            "frames": trainer.counters.frames,
+            "updates": trainer.learner.updates,
+            "hours": trainer.counters.seconds / 3600,
+            "evaluation": trainer.last_metrics,
+            "report": report,
+        }
+    )
+    print(f"\n{report}\n\nrun {folder.name}: {trainer.counters.steps:,} steps, {trainer.counters.seconds:,.0f} s")
+
+
+def _facts(trainer: "Trainer") -> dict[str, str]:
+    """What the config leaves to the machine, as tags."""
+    import torch
+
+    return {
+        "device": str(trainer.learner.device),
+        "precision": str(trainer.learner.dtype).removeprefix("torch."),
+        "threads": str(torch.get_num_threads()),
+    }
+
+
+def main() -> None:
+    """Compose and train."""
+    run_verb("config", Config, train)

@@ -1,0 +1,165 @@
+"""One Atlantis on ALE: equal to Gymnasium's for the same seed and actions, saved and restored exactly."""
+
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import gymnasium
+import numpy as np
+from ale_py import ALEInterface, ALEState, LoggerMode
+from ale_py.roms import get_rom_path
+
+from atlantis_exp.game.preprocessing import PALETTE, SCREEN_HEIGHT, SCREEN_WIDTH, Pixels, Preprocessing
+
+ACTIONS = ("NOOP", "FIRE", "RIGHTFIRE", "LEFTFIRE")
+"""ALE's minimal action set of Atlantis; an action is an index into it."""
+
+ALEInterface.setLoggerMode(LoggerMode.Error)  # of the whole process, and before the first emulator prints its banner
+
+
+class Step(NamedTuple):
+    """What one step of the agent led to."""
+
+    observation: Pixels  # (size, size)
+    reward: float  # the game's own, never clipped
+    terminated: bool
+    truncated: bool
+    frames: int  # emulated in this step
+
+
+class Emulator:
+    """One game of Atlantis, from frames to observations; before its first seed it plays as if seeded with 0.
+
+    frameskip: frames in a step, or (low, high): drawn from low to high - 1 in every step, as in `Atlantis-v0`.
+    sticky: probability that a frame repeats the action of the one before (Machado et al., 2018).
+    max_frames: frames after which an episode is truncated.
+    max_steps: steps after which an episode is truncated (27,000 in report figure 1.3), or None.
+    noop_max: an episode begins with 1 to `noop_max` frames of NOOP; 0 for none.
+    max_pool: a pixel is the brighter of a step's last two frames (Mnih et al., 2015), and a step stops where the
+        episode ends, both as in Gymnasium's `AtariPreprocessing`. Raises ValueError where a step may be one frame.
+    """
+
+    def __init__(
+        self,
+        *,
+        preprocessing: Preprocessing,
+        frameskip: int | tuple[int, int],
+        sticky: float,
+        max_frames: int,
+        max_steps: int | None,
+        noop_max: int,
+        max_pool: bool,
+    ) -> None:
+        self.preprocessing = preprocessing
+        self._frameskip = frameskip
+        self._max_steps = max_steps
+        self._noop_max = noop_max
+        self._max_pool = max_pool
+        if max_pool and (frameskip if isinstance(frameskip, int) else frameskip[0]) < 2:
+            raise ValueError(f"max_pool needs two frames in every step, frameskip is {frameskip}")
+
+        self._ale = ALEInterface()
+        self._ale.setFloat("repeat_action_probability", sticky)
+        self._ale.setInt("max_num_frames_per_episode", max_frames)
+        self._load_game(seed=0)
+        self._actions = self._ale.getMinimalActionSet()
+        self._steps = 0
+        self._screen: Pixels = np.zeros((SCREEN_HEIGHT, SCREEN_WIDTH), np.uint8)
+        self._pool = preprocessing.grey(self._screen)  # of the last step, cropped; max_pool only
+
+    @property
+    def lives(self) -> int:
+        """Buildings that stand, guns included; it can rise again."""
+        return self._ale.lives()
+
+    def screen_rgb(self) -> Pixels:
+        """Returns the frame on screen in colour, (210, 160, 3) uint8."""
+        return PALETTE.take(self._screen, axis=0)
+
+    def reset(self, seed: int | None = None) -> Pixels:
+        """Begins an episode and returns its first observation; without a seed the random streams go on."""
+        if seed is not None:
+            self._load_game(seed)
+        self._ale.reset_game()
+        if self._noop_max:
+            for _ in range(self._generator.integers(1, self._noop_max + 1)):
+                self._ale.act(self._actions[0])
+        self._steps = 0
+        self._ale.getScreen(self._screen)
+        self._pool = self.preprocessing.grey(self._screen)
+        return self.preprocessing.resize(self._pool)
+
+    def step(self, action: int) -> Step:
+        """Plays an action for one frameskip; an episode that could be both terminated and truncated is terminated."""
+        frameskip = self._frameskip
+        if not isinstance(frameskip, int):
+            frameskip = int(self._generator.integers(*frameskip))
+        before = self._ale.getFrameNumber()
+        if self._max_pool:
+            reward = self._act_and_pool(action, frameskip)
+        else:
+            # Also past the episode's end, where ALE emulates nothing but still draws for the sticky actions.
+            reward = sum(self._ale.act(self._actions[action]) for _ in range(frameskip))
+        self._ale.getScreen(self._screen)
+        observation = self.preprocessing.resize(self._pool) if self._max_pool else self.preprocessing(self._screen)
+        self._steps += 1
+        terminated = self._ale.game_over(with_truncation=False)
+        truncated = not terminated and (self._ale.game_truncated() or self._steps == self._max_steps)
+        return Step(observation, float(reward), terminated, truncated, self._ale.getFrameNumber() - before)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "ale": np.frombuffer(self._ale.cloneState(include_rng=True).serialize(), np.uint8),
+            "generator": self._generator.bit_generator.state,
+            "steps": self._steps,
+            "screen": self._screen.copy(),  # ALE draws no screen when it restores a state
+            "pool": self._pool,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._ale.restoreState(ALEState(state["ale"].tobytes()))
+        self._generator.bit_generator.state = state["generator"]
+        self._steps = state["steps"]
+        self._screen[:] = state["screen"]
+        self._pool = state["pool"]
+
+    def _load_game(self, seed: int) -> None:
+        """Starts both random streams, split as in ale_py.env.AtariEnv.seed_game; ALE takes a seed only with a game."""
+        own_seed, ale_seed = np.random.SeedSequence(seed).generate_state(2)
+        self._generator = np.random.default_rng(own_seed)
+        self._ale.setInt("random_seed", ale_seed.astype(np.int32))
+        self._ale.loadROM(cast(Path, get_rom_path("atlantis")))
+
+    def _act_and_pool(self, action: int, frameskip: int) -> int:
+        """Returns the reward; a step cut short pools with the step before, as in `AtariPreprocessing`."""
+        reward = 0
+        before_last = last = self._pool
+        for left in reversed(range(frameskip)):
+            reward += self._ale.act(self._actions[action])
+            if self._ale.game_over():
+                break
+            if left <= 1:
+                self._ale.getScreen(self._screen)
+                before_last, last = last, self.preprocessing.grey(self._screen)
+        self._pool = np.maximum(before_last, last)
+        return reward
+
+
+def query_environment(name: str) -> dict[str, object]:
+    """Returns what Gymnasium says of an Atari environment (report figures 1.1 to 1.3), with its cap on frames.
+
+    The reward range is gym's default: Atari never narrowed it, and Gymnasium 1.0 dropped the attribute.
+    """
+    spec = gymnasium.spec(name)
+    env = gymnasium.make(name)
+    answers = {
+        "action_space": str(env.action_space),
+        "possible_actions": env.get_wrapper_attr("get_action_meanings")(),
+        "observation_space": str(env.observation_space),
+        "max_episode_steps": spec.max_episode_steps,
+        "max_episode_frames": spec.kwargs["max_num_frames_per_episode"],
+        "nondeterministic": spec.nondeterministic,
+        "reward_range": (-np.inf, np.inf),
+        "reward_threshold": spec.reward_threshold,
+    }
+    env.close()
+    return answers

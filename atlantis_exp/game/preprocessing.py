@@ -1,0 +1,97 @@
+"""From a screen of the Atari 2600 to an observation, and from observations to a state."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+Pixels = npt.NDArray[np.uint8]
+Envs = Sequence[int] | npt.NDArray[np.intp]
+
+SCREEN_HEIGHT, SCREEN_WIDTH = 210, 160  # pixels
+
+# RRGGBB of the 128 colours of the NTSC console as ALE draws them (its src/ale/common/Palettes.hpp).
+_NTSC = bytes.fromhex(
+    "0000004a4a4a6f6f6f8e8e8eaaaaaac0c0c0d6d6d6ececec48480069690f86861da2a22abbbb35d2d240e8e84afcfc54"
+    "7c2c00904811a26221b47a30c3903dd2a44adfb755ecc860901c00a33915b55328c66c3ad5824ae39759f0aa67fcbc74"
+    "940000a71a1ab83232c84848d65c5ce46f6ff08080fc909084006497197aa8308fb846a2c659b3d46cc3e07cd2ec8ce0"
+    "50008468199a7d30ad9246c0a459d0b56ce0c57ceed48cfc140090331aa34e32b56848c67f5cd5956fe3a980f0bc90fc"
+    "000094181aa72d32b84248c8545cd6656fe47580f08490fc001c88183b9d2d57b04272c2548ad265a0e175b5ef84c8fc"
+    "0030641850802d6d984288b054a0c565b7d975cceb84e0fc00403018624e2d8169429e8254b89965d1ae75e7c284fcd4"
+    "0044001a661a32843248a0485cba5c6fd26f80e88090fc90143c00355f18527e2d6e9c4287b7549ed065b4e775c8fc84"
+    "3038005059166d762b88923ea0ab4fb7c25fccd86ee0ec7c482c00694d14866a26a28638bb9f47d2b656e8cc63fce070"
+)
+
+PALETTE: Pixels = np.repeat(np.frombuffer(_NTSC, np.uint8).reshape(128, 3), 2, axis=0)
+"""RGB of each palette index, (256, 3): the console ignores the lowest bit of a colour."""
+
+GREY = cast(Pixels, cv2.cvtColor(PALETTE[np.newaxis], cv2.COLOR_RGB2GRAY)[0])
+"""Grey of each palette index, (256,): OpenCV's RGB2GRAY (report figure 2.3) and, in every colour, ALE's own grey."""
+
+
+@dataclass(frozen=True)
+class Preprocessing:
+    """Turns a screen of palette indices, (210, 160) uint8, into an observation, (size, size) uint8.
+
+    Grey, crop, area interpolation: within one grey level of 255 times the float of report figure 2.3. `crop` is its
+    `exclude`, (UP, RIGHT, DOWN, LEFT) in pixels: rows UP to DOWN - 1 and columns LEFT to RIGHT - 1 stay. Raises
+    ValueError if that is no part of the screen.
+    """
+
+    size: int
+    crop: tuple[int, int, int, int]
+
+    def __post_init__(self) -> None:
+        up, right, down, left = self.crop
+        if not (0 <= up < down <= SCREEN_HEIGHT and 0 <= left < right <= SCREEN_WIDTH):
+            raise ValueError(f"crop (UP, RIGHT, DOWN, LEFT) = {self.crop} is no part of a 210x160 screen")
+
+    def __call__(self, screen: Pixels) -> Pixels:
+        return self.resize(self.grey(screen))
+
+    def grey(self, screen: Pixels) -> Pixels:
+        """Returns the crop of a screen of palette indices in grey, (DOWN - UP, RIGHT - LEFT) uint8."""
+        up, right, down, left = self.crop
+        return cast(Pixels, cv2.LUT(screen[up:down, left:right], GREY))
+
+    def resize(self, grey: Pixels) -> Pixels:
+        """Returns a crop in grey at the observation's size, (size, size) uint8."""
+        return cast(Pixels, cv2.resize(grey, (self.size, self.size), interpolation=cv2.INTER_AREA))
+
+
+class FrameStack:
+    """The newest `stack` observations of each environment, oldest first; an episode's first stands for any before it.
+
+    `state` is (num_envs, stack, size, size) uint8. A change makes a new array, so a state handed out stays as it was:
+    `stack_frame` of report figure 2.3 shifts in place, and every next state is its state.
+    """
+
+    def __init__(self, num_envs: int, size: int, stack: int = 4) -> None:
+        self.state: Pixels = np.zeros((num_envs, stack, size, size), np.uint8)
+
+    def reset(self, envs: Envs, observations: Pixels) -> Pixels:
+        """Begins an episode in `envs` with these observations, (len(envs), size, size); returns the state of all."""
+        return self._replace(envs, observations[:, np.newaxis])
+
+    def push(self, observations: Pixels, envs: Envs | None = None) -> Pixels:
+        """Appends these observations, (len(envs), size, size), in `envs`, by default all; returns the state of all."""
+        older = self.state if envs is None else self.state[np.asarray(envs, np.intp)]
+        stacks = np.concatenate([older[:, 1:], observations[:, np.newaxis]], axis=1)
+        if envs is None:
+            self.state = stacks
+            return stacks
+        return self._replace(envs, stacks)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"state": self.state}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.state = state["state"]
+
+    def _replace(self, envs: Envs, stacks: Pixels) -> Pixels:
+        self.state = self.state.copy()
+        self.state[np.asarray(envs, np.intp)] = stacks
+        return self.state

@@ -1,0 +1,237 @@
+"""Many emulators in lock-step, here or in worker processes; neither their number nor timing changes a result."""
+
+import atexit
+import multiprocessing
+import signal
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from ctypes import Array, c_ubyte
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Any, NamedTuple, Self, final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from atlantis_exp.game.emulator import Emulator
+from atlantis_exp.game.preprocessing import Envs, Pixels
+
+Rows = npt.NDArray[np.void]  # the last Step of each environment
+Calls = dict[int, tuple[Any, ...]]  # environment to the arguments of a call of its emulator
+
+_FOR_THE_PARENT = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
+
+
+class WorkerDied(RuntimeError):
+    """A worker process has ended; the message names it, its environments and the cause."""
+
+
+class Steps(NamedTuple):
+    """A step of several environments, in the order they were named; the arrays are the caller's."""
+
+    observations: Pixels  # (len(envs), size, size)
+    rewards: npt.NDArray[np.float64]
+    terminated: npt.NDArray[np.bool_]
+    truncated: npt.NDArray[np.bool_]
+    frames: npt.NDArray[np.int64]
+
+
+class Emulators(ABC):
+    """Emulators of environments 0 to num_envs - 1; none begins an episode by itself.
+
+    `envs` are distinct, by default all. Raises RuntimeError where anything but `receive` follows `send`.
+    """
+
+    def __init__(self, num_envs: int, rows: Rows) -> None:
+        self.num_envs = num_envs
+        self._rows = rows
+        self._sent: Envs | None = None
+
+    def reset(self, envs: Envs, seeds: Sequence[int] | None = None) -> Pixels:
+        """Begins an episode in each of `envs` and returns the first observations, (len(envs), size, size)."""
+        self._call("reset", {int(env): () if seeds is None else (seeds[i],) for i, env in enumerate(envs)})
+        self._results()
+        return self._columns(envs).observations
+
+    def send(self, actions: Sequence[int] | npt.NDArray[np.int64], envs: Envs | None = None) -> None:
+        """Starts a step of `envs` with one action each."""
+        envs = range(self.num_envs) if envs is None else envs
+        self._call("step", {int(env): (int(action),) for env, action in zip(envs, actions, strict=True)})
+        self._sent = envs
+
+    def receive(self) -> Steps:
+        """Waits for the step that was sent and returns it."""
+        if self._sent is None:
+            raise RuntimeError("no step was sent")
+        envs, self._sent = self._sent, None
+        self._results()
+        return self._columns(envs)
+
+    def step(self, actions: Sequence[int] | npt.NDArray[np.int64], envs: Envs | None = None) -> Steps:
+        """Plays a step of `envs` with one action each."""
+        self.send(actions, envs)
+        return self.receive()
+
+    def state_dict(self) -> dict[str, Any]:
+        self._call("state_dict", dict.fromkeys(range(self.num_envs), ()))
+        return {str(env): state for env, state in sorted(self._results().items())}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._call("load_state_dict", {env: (state[str(env)],) for env in range(self.num_envs)})
+        self._results()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @abstractmethod
+    def close(self) -> None:
+        """Ends what runs outside this process; a second call does nothing."""
+
+    @abstractmethod
+    def _start(self, method: str, calls: Calls) -> None: ...
+
+    @abstractmethod
+    def _results(self) -> dict[int, Any]:
+        """Waits for the calls that were started; what they return by environment, but for what went into the rows."""
+
+    def _call(self, method: str, calls: Calls) -> None:
+        if self._sent is not None:
+            raise RuntimeError("a step was sent and not received")
+        self._start(method, calls)
+
+    def _columns(self, envs: Envs) -> Steps:
+        return Steps(*(self._rows[name][np.asarray(envs, np.intp)] for name in Steps._fields))
+
+
+@final
+class SerialEmulators(Emulators):
+    """Emulators in this process; `send` plays the step."""
+
+    def __init__(self, make: Callable[[], Emulator], num_envs: int) -> None:
+        self._emulators = {env: make() for env in range(num_envs)}
+        super().__init__(num_envs, np.empty(num_envs, _row(self._emulators[0].preprocessing.size)))
+
+    def close(self) -> None:
+        pass
+
+    def _start(self, method: str, calls: Calls) -> None:
+        self._played = _play(self._emulators, self._rows, method, calls)
+
+    def _results(self) -> dict[int, Any]:
+        return self._played
+
+
+@final
+class ProcessEmulators(Emulators):
+    """Emulators in worker processes, which play between `send` and `receive`.
+
+    Steps come through shared memory without a name, all else through pipes. Workers leave signals to this process and
+    end when it does. Waiting for one that has ended raises WorkerDied, once the others are ended too.
+    """
+
+    def __init__(self, make: Callable[[], Emulator], num_envs: int, workers: int) -> None:
+        row = _row(make().preprocessing.size)  # and what `make` raises, it raises here
+        context = multiprocessing.get_context("spawn")  # torch's threads make a fork unsafe
+        memory = context.RawArray(c_ubyte, num_envs * row.itemsize)
+        super().__init__(num_envs, np.frombuffer(memoryview(memory), row))
+        self._envs = [range(worker, num_envs, workers) for worker in range(workers)]
+        self._connections: list[Connection[Any, Any]] = []
+        self._processes: list[multiprocessing.context.SpawnProcess] = []
+        atexit.register(self.close)  # multiprocessing's own exit waits for workers that are deaf to its SIGTERM
+        for envs in self._envs:
+            connection, theirs = context.Pipe()
+            process = context.Process(target=_work, args=(theirs, make, envs, memory, row), daemon=True)
+            process.start()
+            theirs.close()  # the worker now holds the only other end, so its death ends the pipe
+            self._connections.append(connection)
+            self._processes.append(process)
+
+    def close(self) -> None:
+        atexit.unregister(self.close)
+        for connection, process in zip(self._connections, self._processes, strict=True):
+            connection.close()
+            process.kill()
+            process.join()
+
+    def _start(self, method: str, calls: Calls) -> None:
+        for envs, connection in zip(self._envs, self._connections, strict=True):
+            with suppress(ConnectionError):  # the worker has died; why, its last answer or the lack of one tells
+                connection.send((method, {env: calls[env] for env in envs if env in calls}))
+
+    def _results(self) -> dict[int, Any]:
+        results: dict[int, Any] = {}
+        for worker, connection in enumerate(self._connections):
+            try:
+                played, error = connection.recv()
+            except (EOFError, ConnectionError):
+                played, error = {}, _cause_of_death(self._processes[worker])
+            if error is not None:
+                self.close()
+                raise WorkerDied(f"emulator worker {worker}, environments {list(self._envs[worker])}, died of {error}")
+            results |= played
+        return results
+
+
+def make_emulators(make: Callable[[], Emulator], num_envs: int, workers: int) -> Emulators:
+    """Returns `num_envs` emulators that `make`, a picklable call, builds in `workers` processes.
+
+    A single environment, or no worker, stays in this process.
+    """
+    if num_envs == 1 or workers == 0:
+        return SerialEmulators(make, num_envs)
+    return ProcessEmulators(make, num_envs, min(workers, num_envs))
+
+
+def _row(size: int) -> np.dtype[np.void]:
+    formats = [(np.uint8, (size, size)), np.float64, np.bool_, np.bool_, np.int64]
+    return np.dtype({"names": Steps._fields, "formats": formats}, align=True)
+
+
+def _play(emulators: dict[int, Emulator], rows: Rows, method: str, calls: Calls) -> dict[int, Any]:
+    """Calls a method of emulators; steps and first observations go into the rows, all else is returned."""
+    returned = {}
+    for env, arguments in calls.items():
+        result = getattr(emulators[env], method)(*arguments)
+        if method == "step":
+            rows[env] = result
+        elif method == "reset":
+            rows["observations"][env] = result
+        else:
+            returned[env] = result
+    return returned
+
+
+def _work(
+    connection: "Connection[Any, Any]",
+    make: Callable[[], Emulator],
+    envs: Iterable[int],
+    memory: "Array[c_ubyte]",
+    row: np.dtype[np.void],
+) -> None:
+    """Plays what the parent asks for until it closes the pipe or dies; an error is the last answer."""
+    for number in _FOR_THE_PARENT:
+        signal.signal(number, signal.SIG_IGN)
+    cv2.setNumThreads(1)
+    try:
+        emulators = {env: make() for env in envs}
+        rows = np.frombuffer(memoryview(memory), row)
+        while True:
+            method, calls = connection.recv()
+            connection.send((_play(emulators, rows, method, calls), None))
+    except (EOFError, ConnectionError):
+        pass
+    except Exception as error:
+        connection.send(({}, repr(error)))
+
+
+def _cause_of_death(process: "multiprocessing.context.SpawnProcess") -> str:
+    process.join()
+    assert process.exitcode is not None
+    return signal.Signals(-process.exitcode).name if process.exitcode < 0 else f"exit code {process.exitcode}"

@@ -1,0 +1,44 @@
+"""The network of the DQN paper."""
+
+import torch
+from torch import nn
+
+from atlantis_exp.networks.sizes import convolved
+
+
+class DQNCnn(nn.Module):
+    """Three convolutions and two dense layers (report figure 2.1; Mnih et al. 2015).
+
+    Input (B, C, H, W) in [0, 1], output (B, num_actions). The report fixes H = W = 84; here the first dense layer
+    follows from `input_shape` = (C, H, W). Raises ValueError if a side is below `smallest_side`.
+    """
+
+    smallest_side = 36  # pixels; 36 -> 8 -> 3 -> 1
+
+    def __init__(self, input_shape: tuple[int, int, int], num_actions: int) -> None:
+        super().__init__()
+        channels, height, width = input_shape
+        if min(height, width) < self.smallest_side:
+            raise ValueError(f"DQNCnn needs {self.smallest_side} pixels a side at least, not {height}x{width}")
+        self.features = nn.Sequential(  # 84x84
+            nn.Conv2d(channels, 32, kernel_size=8, stride=4),  # 20x20
+            nn.ReLU(),
+            nn.Conv2d(32, 64, kernel_size=4, stride=2),  # 9x9
+            nn.ReLU(),
+            nn.Conv2d(64, 64, kernel_size=3, stride=1),  # 7x7
+            nn.ReLU(),
+        )
+        self.feature_size = 64 * _last_side(height) * _last_side(width)
+        self.fc = nn.Sequential(
+            nn.Linear(self.feature_size, 512),
+            nn.ReLU(),
+            nn.Linear(512, num_actions),
+        )
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        q_BA: torch.Tensor = self.fc(self.features(x).flatten(1))
+        return q_BA
+
+
+def _last_side(side: int) -> int:
+    return convolved(convolved(convolved(side, kernel=8, stride=4), kernel=4, stride=2), kernel=3, stride=1)

@@ -1,0 +1,91 @@
+"""The residual network of the report."""
+
+import torch
+from torch import nn
+
+from atlantis_exp.networks.dropout import Dropout
+from atlantis_exp.networks.sizes import convolved
+
+
+class ResNetBlock(nn.Module):
+    """A basic residual block (He et al. 2016, figure 2; option B of section 4.1), which the report uses and leaves out.
+
+    Given `out_channels` it halves the sides, rounding up, and projects its shortcut with a 1x1 convolution of stride 2.
+    It departs from He et al. in its activation alone, and from the report's stem in normalising before activating.
+    """
+
+    def __init__(self, in_channels: int, activation: type[nn.Module], out_channels: int | None = None) -> None:
+        super().__init__()
+        stride = 1 if out_channels is None else 2
+        channels = out_channels or in_channels
+        self.residual = nn.Sequential(
+            nn.Conv2d(in_channels, channels, kernel_size=3, stride=stride, padding=1, bias=False),
+            nn.BatchNorm2d(channels),
+            activation(),
+            nn.Conv2d(channels, channels, kernel_size=3, padding=1, bias=False),
+            nn.BatchNorm2d(channels),
+        )
+        self.shortcut: nn.Module = nn.Identity()
+        if out_channels is not None:
+            self.shortcut = nn.Sequential(
+                nn.Conv2d(in_channels, channels, kernel_size=1, stride=2, bias=False),
+                nn.BatchNorm2d(channels),
+            )
+        self.activation = activation()
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        y: torch.Tensor = self.activation(self.residual(x) + self.shortcut(x))
+        return y
+
+
+class ResNetDQN(nn.Module):
+    """Fourteen convolutions in the main path, four of them the stem, and two dense layers (report figure 2.2).
+
+    Input (B, C, H, W) in [0, 1], output (B, num_actions). The report fixes H = W = 159; here the first dense layer
+    follows from `input_shape` = (C, H, W). Raises ValueError if a side is below `smallest_side`.
+    """
+
+    smallest_side = 15  # pixels; 15 -> 7 -> 5 -> 3 -> 1
+
+    def __init__(self, input_shape: tuple[int, int, int], num_actions: int) -> None:
+        super().__init__()
+        channels, height, width = input_shape
+        if min(height, width) < self.smallest_side:
+            raise ValueError(f"ResNetDQN needs {self.smallest_side} pixels a side at least, not {height}x{width}")
+        self.block1 = nn.Sequential(  # 159x159
+            nn.Conv2d(channels, 16, kernel_size=3, stride=2),  # 79x79
+            nn.SiLU(inplace=True),
+            nn.BatchNorm2d(16),
+            nn.Conv2d(16, 32, kernel_size=3),  # 77x77
+            nn.SiLU(inplace=True),
+            nn.BatchNorm2d(32),
+            nn.Conv2d(32, 32, kernel_size=3),  # 75x75
+            nn.SiLU(inplace=True),
+            nn.BatchNorm2d(32),
+            nn.Conv2d(32, 32, kernel_size=3, stride=2),  # 37x37
+        )
+        self.feature_extraction = nn.Sequential(
+            ResNetBlock(32, nn.SiLU, 64),  # 19x19
+            ResNetBlock(64, nn.SiLU),
+            ResNetBlock(64, nn.SiLU),
+            ResNetBlock(64, nn.SiLU, 128),  # 10x10
+            ResNetBlock(128, nn.SiLU),
+        )
+        self.flattened_size = 128 * _last_side(height) * _last_side(width)
+        self.regression = nn.Sequential(
+            Dropout(0.3),
+            nn.Linear(self.flattened_size, 1024),
+            Dropout(0.2),
+            nn.SiLU(inplace=True),
+            nn.Linear(1024, num_actions),
+        )
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        q_BA: torch.Tensor = self.regression(self.feature_extraction(self.block1(x)).flatten(1))
+        return q_BA
+
+
+def _last_side(side: int) -> int:
+    for stride in (2, 1, 1, 2):
+        side = convolved(side, kernel=3, stride=stride)
+    return -(-side // 4)  # two blocks halve it, rounding up

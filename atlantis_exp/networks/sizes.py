@@ -1,0 +1,13 @@
+"""How large things are: feature maps after a convolution, networks in parameters."""
+
+from torch import nn
+
+
+def convolved(side: int, kernel: int, stride: int, padding: int = 0) -> int:
+    """Return the side of the feature map that a convolution makes of an input of this side, both in pixels."""
+    return (side + 2 * padding - kernel) // stride + 1
+
+
+def count_parameters(network: nn.Module) -> int:
+    """Return the number of learned values of a network; running statistics are not counted."""
+    return sum(parameter.numel() for parameter in network.parameters())

@@ -1,0 +1,100 @@
+"""Compressed frames in one ring of bytes."""
+
+import math
+
+import lz4.block
+import numpy as np
+import numpy.typing as npt
+
+
+class FrameStore:
+    """Ring of compressed uint8 frames with consecutive ids that never takes more than `budget_bytes`.
+
+    Every frame is one LZ4 block whose dictionary is the first frame ever encoded: whatever of the background stays as
+    it was at the start of play costs next to nothing (in Atlantis without a crop half of all bytes), and decoding is as
+    fast. Memory that frames have not reached yet is reserved but not resident.
+
+    Args:
+        capacity: most frames held.
+        frame_shape: shape of every frame, (H, W).
+        budget_bytes: bound on buffer and index together.
+
+    Raises:
+        ValueError: the budget does not hold even eight frames of noise, two states of four.
+    """
+
+    def __init__(self, capacity: int, frame_shape: tuple[int, ...], budget_bytes: int) -> None:
+        self.capacity = capacity
+        self.frame_shape = frame_shape
+        self.frame_bytes = math.prod(frame_shape)
+        self.max_length = self.frame_bytes + self.frame_bytes // 255 + 16  # bytes; LZ4's bound for noise
+        self._starts = np.zeros(capacity, np.int64)
+        self._lengths = np.zeros(capacity, np.uint32)
+        # A frame that begins inside the ring may end beyond it, so that each lies in one piece.
+        self._ring_bytes = budget_bytes - self._starts.nbytes - self._lengths.nbytes - self.max_length
+        if self._ring_bytes < 8 * self.max_length:
+            raise ValueError(
+                f"a replay budget of {budget_bytes:,} bytes does not hold {capacity:,} index entries "
+                f"and eight incompressible {frame_shape} frames"
+            )
+        self._buffer = np.empty(self._ring_bytes + self.max_length, np.uint8).data
+        self.clear(0, b"")
+
+    def clear(self, next_id: int, dictionary: bytes) -> None:
+        """Forget all frames; the next one appended gets `next_id` and was encoded with `dictionary`."""
+        self.oldest_id = next_id
+        self.next_id = next_id
+        self.dictionary = dictionary
+        self._used_bytes = 0
+        self._head = 0
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in use: index and compressed frames."""
+        return self._starts.nbytes + self._lengths.nbytes + self._used_bytes
+
+    def encode(self, frame: npt.NDArray[np.uint8]) -> bytes:
+        """Compress one frame; the first one ever becomes the dictionary.
+
+        Raises:
+            ValueError: `frame` is not uint8 or not of `frame_shape`.
+        """
+        if frame.shape != self.frame_shape or frame.dtype != np.uint8:
+            raise ValueError(f"replay holds uint8 frames of {self.frame_shape}, not {frame.dtype} of {frame.shape}")
+        frame = np.ascontiguousarray(frame)
+        if not self.dictionary:
+            self.dictionary = frame.tobytes()
+        data: bytes = lz4.block.compress(frame, store_size=False, dict=self.dictionary)
+        return data
+
+    def append(self, data: bytes | memoryview) -> None:
+        """Store an encoded frame as `next_id`, evicting the oldest until both count and bytes suffice."""
+        while self.next_id - self.oldest_id == self.capacity or self._used_bytes + len(data) > self._ring_bytes:
+            self._used_bytes -= self._lengths.item(self.oldest_id % self.capacity)
+            self.oldest_id += 1
+        slot = self.next_id % self.capacity
+        self._starts[slot] = self._head
+        self._lengths[slot] = len(data)
+        self._buffer[self._head : self._head + len(data)] = data
+        self._used_bytes += len(data)
+        self._head = (self._head + len(data)) % self._ring_bytes
+        self.next_id += 1
+
+    def decode(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
+        """Return the frames of stored `ids` as a fresh array of shape `(*ids.shape, *frame_shape)`."""
+        size = self.frame_bytes
+        frames = np.empty((*ids.shape, *self.frame_shape), np.uint8)
+        target = frames.reshape(-1).data
+        for i, data in enumerate(self._encoded(ids.ravel())):
+            target[i * size : (i + 1) * size] = lz4.block.decompress(data, uncompressed_size=size, dict=self.dictionary)
+        return frames
+
+    def segment(self, ids: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint8]]:
+        """Return the encoded frames of stored `ids`: their lengths in bytes and the bytes one after another."""
+        return self._lengths[ids % self.capacity], np.frombuffer(bytearray().join(self._encoded(ids)), np.uint8)
+
+    def _encoded(self, ids: npt.NDArray[np.int64]) -> list[memoryview]:
+        slots = ids % self.capacity
+        starts = self._starts[slots]
+        stops = starts + self._lengths[slots]
+        return [self._buffer[start:stop] for start, stop in zip(starts.tolist(), stops.tolist(), strict=True)]

@@ -1,0 +1,310 @@
+"""Transitions by id over a ring of observations."""
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from atlantis_exp.replay.frames import FrameStore
+
+_MAX_BACK = 65_535  # observations; the largest distance an entry can name
+_ENTRY_DTYPES: dict[str, type[np.generic]] = {
+    "lengths": np.uint32,  # bytes
+    "back": np.uint16,
+    "action": np.uint8,
+    "reward": np.float32,
+    "terminated": np.bool_,
+}
+_SEGMENT_DTYPES = _ENTRY_DTYPES | {"data": np.uint8, "dictionary": np.uint8, "envs": np.int64, "newest": np.int64}
+
+
+class Transitions(NamedTuple):
+    """A batch of B transitions; s_t and s_tp1 are two windows on one fresh array and share their common frames."""
+
+    s_t: npt.NDArray[np.uint8]  # (B, stack, H, W)
+    a_t: npt.NDArray[np.int64]  # (B,)
+    r_t: npt.NDArray[np.float32]  # (B,)
+    s_tp1: npt.NDArray[np.uint8]  # (B, stack, H, W)
+    terminated: npt.NDArray[np.bool_]  # (B,)
+
+
+class ReplayMemory:
+    """The newest observations of interleaved episodes, each stored once, read as transitions.
+
+    An entry is an observation with the step that led to it: its action, reward, termination, and `back`, the distance
+    in ids to the observation before it (0: an episode's first). Entries never change once appended. A transition bears
+    the id of its state's newest observation; it is available while it has a successor and all frames of both states are
+    stored. Where a state reaches back beyond its episode, the first observation repeats (report figure 2.3, `is_new`).
+
+    Args:
+        capacity: most observations held; an episode of n steps has n + 1.
+        frame_shape: shape of an observation, (H, W).
+        stack: observations in a state.
+        budget_bytes: bound on all the memory's bytes; observations that compress badly are forgotten earlier.
+
+    Raises:
+        ValueError: capacity or budget is too small for any use.
+    """
+
+    def __init__(self, capacity: int, frame_shape: tuple[int, int], *, stack: int = 4, budget_bytes: int) -> None:
+        if capacity <= stack:
+            raise ValueError(f"a transition of {stack + 1} observations does not fit a replay capacity of {capacity}")
+        self.capacity = capacity
+        self.stack = stack
+        self._back = np.zeros(capacity, np.uint16)
+        self._forward = np.zeros(capacity, np.uint16)
+        self._action = np.zeros(capacity, np.uint8)
+        self._reward = np.zeros(capacity, np.float32)
+        self._terminated = np.zeros(capacity, np.bool_)
+        self._available = np.zeros(capacity, np.bool_)
+        arrays = (self._back, self._forward, self._action, self._reward, self._terminated, self._available)
+        self._index_bytes = sum(array.nbytes for array in arrays)
+        self._frames = FrameStore(capacity, frame_shape, budget_bytes - self._index_bytes)
+        self._newest: dict[int, int] = {}  # environment -> id of its unfinished episode's newest observation
+        self._num_available = 0
+
+    def __len__(self) -> int:
+        """Count the available transitions."""
+        return self._num_available
+
+    @property
+    def oldest_id(self) -> int:
+        """Id of the oldest observation still stored."""
+        return self._frames.oldest_id
+
+    @property
+    def next_id(self) -> int:
+        """Id that the next observation will get; the number of observations ever seen."""
+        return self._frames.next_id
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in use, never more than `budget_bytes`."""
+        return self._index_bytes + self._frames.nbytes
+
+    def begin(self, env: int, observation: npt.NDArray[np.uint8]) -> None:
+        """Start an episode of environment `env`; one it had left unfinished was truncated."""
+        self._append(self._frames.encode(observation), back=0, action=0, reward=0.0, terminated=False)
+        self._newest[env] = self.next_id - 1
+
+    def add(self, env: int, action: int, reward: float, observation: npt.NDArray[np.uint8], terminated: bool) -> None:
+        """Append the step of environment `env` that led to `observation`.
+
+        Raises:
+            ValueError: `env` has no episode under way, or all others together have appended more than 65,534
+                observations since its last one.
+        """
+        if env not in self._newest:
+            raise ValueError(f"environment {env} has no episode under way: begin one before adding steps")
+        back = self.next_id - self._newest[env]
+        if back > _MAX_BACK:
+            raise ValueError(f"environment {env} was idle for {back - 1:,} observations: begin a new episode")
+        self._append(self._frames.encode(observation), back, action, reward, terminated)
+        if terminated:
+            del self._newest[env]
+        else:
+            self._newest[env] = self.next_id - 1
+
+    def draw(self, count: int, rng: np.random.Generator) -> npt.NDArray[np.int64]:
+        """Draw `count` ids uniformly, with replacement, from the available transitions.
+
+        Raises:
+            ValueError: no transition is available.
+        """
+        if not self._num_available:
+            raise ValueError("replay holds no transition to draw")
+        drawn = np.empty(0, np.int64)
+        while len(drawn) < count:
+            ids = rng.integers(self.oldest_id, self.next_id, size=count)
+            drawn = np.concatenate((drawn, ids[self._available[ids % self.capacity]]))
+        return drawn[:count]
+
+    def rewards(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
+        """Return the rewards of transitions without decoding a frame.
+
+        Raises:
+            ValueError: one of `ids` is not available.
+        """
+        return self._reward[self._successors(ids) % self.capacity]
+
+    def gather(self, ids: npt.NDArray[np.int64]) -> Transitions:
+        """Return whole transitions.
+
+        Raises:
+            ValueError: one of `ids` is not available.
+        """
+        newest_first = [self._successors(ids), ids]
+        for _ in range(self.stack - 1):
+            newest_first.append(newest_first[-1] - self._back[newest_first[-1] % self.capacity])
+        frames = self._frames.decode(np.stack(newest_first[::-1], axis=1))
+        slots = newest_first[0] % self.capacity
+        return Transitions(
+            s_t=frames[:, :-1],
+            a_t=self._action[slots].astype(np.int64),
+            r_t=self._reward[slots],
+            s_tp1=frames[:, 1:],
+            terminated=self._terminated[slots],
+        )
+
+    def segment(self, since: int) -> dict[str, Any]:
+        """Return what a checkpoint needs beyond the segments that reach up to id `since`.
+
+        Entries never change, so each needs to be written only once: `load_segments` puts the pieces together.
+
+        Raises:
+            ValueError: `since` lies in the future.
+        """
+        if since > self.next_id:
+            raise ValueError(f"replay has {self.next_id:,} observations behind it, so none since {since:,}")
+        first_id = max(since, self.oldest_id)
+        ids = np.arange(first_id, self.next_id)
+        slots = ids % self.capacity
+        lengths, data = self._frames.segment(ids)
+        return {
+            "first_id": first_id,
+            "oldest_id": self.oldest_id,
+            "dictionary": np.frombuffer(bytearray(self._frames.dictionary), np.uint8),
+            "data": data,
+            "lengths": lengths,
+            "back": self._back[slots],
+            "action": self._action[slots],
+            "reward": self._reward[slots],
+            "terminated": self._terminated[slots],
+            "envs": np.array(list(self._newest), np.int64),
+            "newest": np.array(list(self._newest.values()), np.int64),
+        }
+
+    def load_segments(self, segments: Iterable[dict[str, Any]]) -> None:
+        """Become the memory that wrote `segments`, given oldest first; those wholly evicted since may be missing.
+
+        What is evicted depends only on the lengths of the entries, so appending them once more leaves the same memory.
+
+        Raises:
+            ValueError: a segment is malformed, one is missing, or they do not fit; the memory is then of no use.
+        """
+        self._clear(0, b"")
+        oldest_id = 0
+        for segment in segments:
+            self._load_segment(segment)
+            oldest_id = segment["oldest_id"]
+        if self.oldest_id != oldest_id:
+            raise ValueError(
+                f"replay segments restore observations since {self.oldest_id:,} instead of {oldest_id:,}: "
+                "a segment is missing, or the memory is smaller than the one that wrote them"
+            )
+        self.check_valid()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything in one segment."""
+        return self.segment(0)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Become the memory that returned `state`.
+
+        Raises:
+            ValueError: as `load_segments`.
+        """
+        self.load_segments([state])
+
+    def check_valid(self) -> None:
+        """Derive anew from the entries what is otherwise kept up step by step, and compare.
+
+        Raises:
+            ValueError: an invariant does not hold.
+        """
+        ids = np.arange(self.oldest_id, self.next_id)
+        slots = ids % self.capacity
+        back = self._back[slots].astype(np.int64)
+        linked = (back > 0) & (ids - back >= self.oldest_id)
+        previous = (ids - back)[linked] - self.oldest_id
+        forward = np.zeros(len(ids), np.int64)
+        forward[previous] = back[linked]
+        reach = ids
+        for _ in range(self.stack - 1):
+            stored = np.maximum(reach - self.oldest_id, 0)
+            reach = np.where(reach >= self.oldest_id, reach - back[stored], reach)
+        available = (forward > 0) & (reach >= self.oldest_id)
+        newest = np.array([k for k in self._newest.values() if k >= self.oldest_id], np.int64)
+        for holds, invariant in (
+            (np.all(back <= ids), "no observation comes before id 0"),
+            (len(np.unique(previous)) == len(previous), "an observation has one successor at most"),
+            (not np.any(self._terminated[slots[previous]]), "a terminated episode does not continue"),
+            (np.array_equal(forward, self._forward[slots]), "forward mirrors back"),
+            (np.array_equal(available, self._available[slots]), "available transitions are those wholly stored"),
+            (np.count_nonzero(available) == len(self), "the length is the number of available transitions"),
+            (len(set(self._newest.values())) == len(self._newest), "no observation belongs to two environments"),
+            (np.all(newest < self.next_id), "an environment's newest observation has been seen"),
+            (not np.any(self._forward[newest % self.capacity]), "an environment's newest observation has no successor"),
+            (not np.any(self._terminated[newest % self.capacity]), "an episode under way has not terminated"),
+        ):
+            if not holds:
+                raise ValueError(f"replay memory is not valid: {invariant}")
+
+    def _clear(self, next_id: int, dictionary: bytes) -> None:
+        self._frames.clear(next_id, dictionary)
+        self._newest = {}
+        self._num_available = 0
+
+    def _append(self, data: bytes | memoryview, back: int, action: int, reward: float, terminated: bool) -> None:
+        oldest_id = self.oldest_id
+        self._frames.append(data)
+        for evicted in range(oldest_id, self.oldest_id):
+            self._withdraw(evicted)
+        k = self.next_id - 1
+        slot = k % self.capacity
+        self._back[slot] = back
+        self._forward[slot] = 0
+        self._action[slot] = action
+        self._reward[slot] = reward
+        self._terminated[slot] = terminated
+        self._available[slot] = False
+        if back and k - back >= self.oldest_id:
+            previous = (k - back) % self.capacity
+            self._forward[previous] = back
+            if self._state_is_stored(k - back):
+                self._available[previous] = True
+                self._num_available += 1
+
+    def _state_is_stored(self, k: int) -> bool:
+        for _ in range(self.stack - 1):
+            k -= self._back.item(k % self.capacity)  # of an entry no longer stored: some distance further back
+        return k >= self.oldest_id
+
+    def _withdraw(self, evicted: int) -> None:
+        k = evicted
+        for _ in range(self.stack):
+            slot = k % self.capacity
+            self._num_available -= self._available.item(slot)
+            self._available[slot] = False
+            k += self._forward.item(slot)
+
+    def _successors(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        slots = ids % self.capacity
+        if not np.all((ids >= self.oldest_id) & (ids < self.next_id) & self._available[slots]):
+            raise ValueError("replay was asked for a transition that is not available")
+        return ids + self._forward[slots]
+
+    def _load_segment(self, segment: dict[str, Any]) -> None:
+        for name, dtype in _SEGMENT_DTYPES.items():
+            array = segment.get(name)
+            if not isinstance(array, np.ndarray) or array.dtype != dtype or array.ndim != 1:
+                raise ValueError(f"replay segment: {name} is not a row of {dtype.__name__}")
+        for name in ("first_id", "oldest_id"):
+            if not isinstance(segment.get(name), int):
+                raise ValueError(f"replay segment: {name} is not an int")
+        lengths, data, dictionary = segment["lengths"], segment["data"], segment["dictionary"].tobytes()
+        if any(len(segment[name]) != len(lengths) for name in _ENTRY_DTYPES):
+            raise ValueError("replay segment: its rows differ in length")
+        if len(dictionary) != self._frames.frame_bytes and (dictionary or len(lengths)):
+            raise ValueError(f"replay segment: it does not hold observations of {self._frames.frame_shape}")
+        if np.any(lengths == 0) or np.any(lengths > self._frames.max_length) or np.sum(lengths) != len(data):
+            raise ValueError("replay segment: the lengths of its observations do not fit its data")
+        if segment["first_id"] != self.next_id or dictionary != self._frames.dictionary:
+            self._clear(segment["first_id"], dictionary)
+        encoded = data.data
+        stops = np.cumsum(lengths, dtype=np.int64).tolist()
+        entries = zip(*(segment[name].tolist() for name in _ENTRY_DTYPES), strict=True)
+        for stop, (length, *entry) in zip(stops, entries, strict=True):
+            self._append(encoded[stop - length : stop], *entry)
+        self._newest = dict(zip(segment["envs"].tolist(), segment["newest"].tolist(), strict=True))

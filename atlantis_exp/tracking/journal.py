@@ -1,0 +1,301 @@
+"""The journal of a run: what happened, durable, exactly once.
+
+A run folder holds `journal.jsonl` (one record a line), `artifacts/` (the files that records name) and `commit.json`
+(how much of the journal counts). Lines become durable with `Journal.state_dict`, and visible with `Journal.commit` once
+a checkpoint holds that state. A resumed run redoes what came later and journals it again, so nothing appears twice.
+"""
+
+import json
+import os
+import re
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal, Protocol, get_args
+from uuid import uuid4
+
+Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Values measured at one step; `time` is in ms since 1970 and never decreases along a journal."""
+
+    step: int
+    time: int
+    values: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Params:
+    """What the run was asked to do."""
+
+    values: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Tags:
+    """What is said about the run; a later value replaces an earlier one."""
+
+    values: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """A file under `artifacts/`."""
+
+    path: str
+
+
+@dataclass(frozen=True)
+class Image:
+    """A PNG under `artifacts/`: one position of the step slider of `key`."""
+
+    key: str
+    step: int
+    time: int
+    path: str
+
+
+@dataclass(frozen=True)
+class Model:
+    """Weights as safetensors under `artifacts/`, with the metrics that they reached."""
+
+    name: str
+    step: int
+    time: int
+    path: str
+    values: dict[str, float]
+
+
+Record = Metrics | Params | Tags | Artifact | Image | Model
+_KINDS: dict[str, type[Record]] = {kind.__name__.lower(): kind for kind in get_args(Record)}
+
+
+@dataclass(frozen=True)
+class Commit:
+    """How much of a journal counts, and how its run stands.
+
+    `identity` is unique to the run and changes when committed lines are taken back; `started` and `updated` are in ms
+    since 1970, `offset` in bytes.
+    """
+
+    identity: str
+    started: int
+    updated: int
+    offset: int
+    status: Status
+
+
+class Tracker(Protocol):
+    """What training may tell about itself."""
+
+    def metrics(self, values: Mapping[str, float], step: int) -> None:
+        """Records values measured at a step."""
+
+    def params(self, values: Mapping[str, str]) -> None:
+        """Records what the run was asked to do."""
+
+    def tags(self, values: Mapping[str, str]) -> None:
+        """Records what is said about the run."""
+
+    def artifact(self, path: str, content: bytes) -> None:
+        """Keeps a file under a relative path; the last content of a path stands."""
+
+    def image(self, key: str, content: bytes, step: int) -> None:
+        """Keeps a PNG of a step."""
+
+    def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float]) -> None:
+        """Keeps weights (safetensors) of a step and the metrics that they reached."""
+
+    def status(self, status: Status) -> None:
+        """Says how the run stands, and reveals nothing else."""
+
+    def commit(self) -> None:
+        """Reveals all that the latest state holds; to be called once a checkpoint holding it is durable."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Makes all records durable and returns where they end."""
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes back to where the state ends; later records are forgotten."""
+
+
+class NullJournal:
+    """A tracker that forgets everything."""
+
+    def metrics(self, values: Mapping[str, float], step: int) -> None: ...
+    def params(self, values: Mapping[str, str]) -> None: ...
+    def tags(self, values: Mapping[str, str]) -> None: ...
+    def artifact(self, path: str, content: bytes) -> None: ...
+    def image(self, key: str, content: bytes, step: int) -> None: ...
+    def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float]) -> None: ...
+    def status(self, status: Status) -> None: ...
+    def commit(self) -> None: ...
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None: ...
+
+
+class Journal:
+    """A tracker that writes a run folder, which has one writer at a time.
+
+    Without `load_state_dict` it begins an empty journal, even in a folder that holds one. Names of metrics, params,
+    tags, images and models are checked against MLflow's alphabet, so that publishing cannot stumble over them later.
+
+    Raises:
+        ValueError: on a name that MLflow would refuse, or a path that leads out of `artifacts/`.
+        OSError: from `state_dict` when the disk refuses; what was durable stays so, and a later call writes the rest.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder = folder
+        self._time = _now()  # ms, of the latest metrics
+        self._offset = 0  # bytes that are durable and that the state speaks for
+        self._lines: list[bytes] = []  # a line that no checkpoint covers would be redone: memory is good enough for it
+        self._commit = read_commit(folder) or Commit(uuid4().hex, self._time, self._time, 0, "RUNNING")
+
+    def metrics(self, values: Mapping[str, float], step: int) -> None:
+        self._time = max(self._time, _now())
+        self._append(Metrics(step, self._time, {_name(key): float(value) for key, value in values.items()}))
+
+    def params(self, values: Mapping[str, str]) -> None:
+        self._append(Params({_name(key): value for key, value in values.items()}))
+
+    def tags(self, values: Mapping[str, str]) -> None:
+        self._append(Tags({_name(key): value for key, value in values.items()}))
+
+    def artifact(self, path: str, content: bytes) -> None:
+        write_file(_inside(self._folder, path), content)
+        self._append(Artifact(path))
+
+    def image(self, key: str, content: bytes, step: int) -> None:
+        path = f"images/{_name(key)}/{step}.png"
+        write_file(_inside(self._folder, path), content)
+        self._append(Image(key, step, self._time, path))
+
+    def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float]) -> None:
+        if set("/.") & set(name):
+            raise ValueError(f"A model's name holds neither '/' nor '.': {name!r}")
+        path = f"models/{_name(name)}/{step}.safetensors"
+        write_file(_inside(self._folder, path), content)
+        # MLflow charts a model's metrics on the run as well: with the time of the metrics just recorded they are the
+        # same points, not second ones.
+        self._append(Model(name, step, self._time, path, {_name(key): float(value) for key, value in metrics.items()}))
+
+    def status(self, status: Status) -> None:
+        self._mark(replace(self._commit, status=status))
+
+    def commit(self) -> None:
+        self._mark(replace(self._commit, offset=self._offset))
+
+    def state_dict(self) -> dict[str, Any]:
+        if self._offset < self._commit.offset:
+            self._mark(replace(self._commit, offset=self._offset))  # readers first: the bytes change under them next
+        content = b"".join(self._lines)
+        with open(self._folder / "journal.jsonl", "ab") as file:
+            file.truncate(self._offset)
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        self._offset += len(content)
+        self._lines.clear()
+        return {"offset": self._offset, "time": self._time}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        path = self._folder / "journal.jsonl"
+        if path.stat().st_size < state["offset"]:
+            raise ValueError(f"{path} is shorter than the checkpoint says: it was cut or replaced since")
+        self._offset, self._time = state["offset"], state["time"]
+        self._lines.clear()
+
+    def _append(self, record: Record) -> None:
+        line = _encode({"kind": type(record).__name__.lower(), **vars(record)})
+        self._lines.append(line.encode() + b"\n")
+
+    def _mark(self, commit: Commit) -> None:
+        # What was visible cannot be unsent: a journal that goes back behind its commit is a new run to its readers.
+        identity = self._commit.identity if commit.offset >= self._commit.offset else uuid4().hex
+        self._commit = replace(commit, identity=identity, updated=_now())
+        write_file(self._folder / "commit.json", _encode(asdict(self._commit)).encode())
+
+
+def read_commit(folder: Path) -> Commit | None:
+    """Returns what the run folder's writer last committed, None before its first commit or status."""
+    path = folder / "commit.json"
+    return Commit(**json.loads(path.read_bytes())) if path.exists() else None
+
+
+def read(folder: Path, start: int = 0, end: int | None = None) -> Iterator[tuple[int, Record]]:
+    """Yields the committed records between two offsets, each with the offset where it ends.
+
+    Args:
+        start: bytes; where a record begins.
+        end: bytes; None stands for the last commit.
+
+    Raises:
+        ValueError: on a journal that ends before `end`, an unknown kind of record, or a path out of `artifacts/`.
+    """
+    if end is None:
+        commit = read_commit(folder)
+        end = commit.offset if commit else 0
+    if start >= end:
+        return
+    with open(folder / "journal.jsonl", "rb") as file:
+        file.seek(start)
+        while start < end:
+            line = file.readline()
+            if not line.endswith(b"\n"):
+                raise ValueError(f"{file.name} ends at byte {start + len(line)}, before its commit at {end}")
+            fields = json.loads(line)
+            kind = fields.pop("kind")
+            if kind not in _KINDS:
+                raise ValueError(f"{file.name} holds a record of unknown kind {kind!r} at byte {start}")
+            if "path" in fields:
+                _inside(folder, fields["path"])
+            start += len(line)
+            yield start, _KINDS[kind](**fields)
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Puts a file in place whole, durably, or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(path.name + ".aside")
+    with open(aside, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    aside.replace(path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def _inside(folder: Path, path: str) -> Path:
+    root = (folder / "artifacts").resolve()
+    file = (root / path).resolve()
+    if root not in file.parents:
+        raise ValueError(f"The path {path!r} does not name a file inside {root}")
+    return file
+
+
+@lru_cache(maxsize=4096)
+def _name(name: str) -> str:
+    if len(name) > 250 or not re.fullmatch(r"\w[\w.\- ]*(/\w[\w.\- ]*)*", name, re.ASCII):
+        raise ValueError(
+            f"MLflow takes letters, digits, '_.- ' and single inner slashes, 250 in all, as a name: {name!r}"
+        )
+    return name
+
+
+def _now() -> int:
+    return time.time_ns() // 1_000_000  # ms
+
+
+_encode = json.JSONEncoder(separators=(",", ":")).encode

@@ -1,0 +1,357 @@
+"""MLflow: a mirror of run folders, which can be thrown away and made again from them.
+
+Sending is at least once and repeatable, hence visible exactly once: MLflow drops a point that it has already (same key,
+step, time and value), files overwrite themselves by name, runs and models are looked up before they are made.
+"""
+
+import fcntl
+import json
+import logging
+import math
+import os
+import sqlite3
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+from uuid import UUID, uuid5
+
+from atlantis_exp.tracking.journal import (
+    Artifact,
+    Commit,
+    Image,
+    Metrics,
+    Model,
+    Params,
+    Tags,
+    read,
+    read_commit,
+    write_file,
+)
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+    from mlflow.entities import Metric
+
+_log = logging.getLogger(__name__)
+
+_POINTS = 500  # a call at least, where there are so many: fewer cost more each
+_PARAM_LENGTH = 6_000  # characters that MLflow keeps
+
+
+@dataclass(frozen=True)
+class StoredRun:
+    """A run as MLflow lists it; `folder` is where it was published from."""
+
+    run_id: str
+    name: str
+    status: str
+    folder: Path
+    params: dict[str, str]
+    tags: dict[str, str]
+
+
+class Store:
+    """One experiment of an MLflow database under `root`, a folder on a local disk, or of the server at `tracking_uri`.
+
+    Constructing one does nothing: MLflow is imported (1-3 s) and its tables are made on first use, which any number of
+    processes may come to at once.
+    """
+
+    def __init__(self, root: Path, experiment: str = "atlantis", tracking_uri: str | None = None) -> None:
+        self._root = root.resolve()
+        self._experiment = experiment
+        self._is_local = tracking_uri is None
+        self.uri = tracking_uri or f"sqlite:///{self._root / 'mlflow.db'}"
+
+    @property
+    def client(self) -> "MlflowClient":
+        """MLflow's own client, for what is not mirrored from a folder."""
+        return self._connection[0]
+
+    @property
+    def experiment_id(self) -> str:
+        """The id of the experiment, which is made if need be."""
+        return self._connection[1]
+
+    def runs(self, name: str | None = None) -> list[StoredRun]:
+        """Returns the runs that were published here, the latest first; given a name, only those that bear it."""
+        published = "tags.`atlantis.folder` != ''"
+        wanted = published if name is None else f'{published} AND attributes.run_name = "{name}"'
+        found: list[StoredRun] = []
+        token: str | None = None
+        while token != "":
+            page = self.client.search_runs([self.experiment_id], wanted, page_token=token)
+            token = page.token or ""
+            found += [
+                StoredRun(
+                    run.info.run_id,
+                    run.info.run_name,
+                    run.info.status,
+                    Path(run.data.tags["atlantis.folder"]),
+                    run.data.params,
+                    run.data.tags,
+                )
+                for run in page
+            ]
+        return found
+
+    @property
+    def address(self) -> str:
+        """What tells this experiment from any other, in this database or elsewhere."""
+        return f"{self.uri}#{self._experiment}"
+
+    def open_run(self, folder: Path, commit: Commit) -> str:
+        """Returns the id of the run that mirrors a folder; makes the run if it is not there."""
+        same = f"tags.`atlantis.identity` = '{commit.identity}'"
+        if found := self.client.search_runs([self.experiment_id], same, max_results=1):
+            return str(found[0].info.run_id)
+        tags = {"atlantis.identity": commit.identity, "atlantis.folder": str(folder)}
+        return str(self.client.create_run(self.experiment_id, commit.started, tags, folder.name).info.run_id)
+
+    def delete_run(self, run_id: str) -> None:
+        """Deletes a run and its models, which MLflow would keep."""
+        while models := self.client.search_logged_models([self.experiment_id], f"source_run_id = '{run_id}'"):
+            for model in models:
+                self.client.delete_logged_model(model.model_id)
+        self.client.delete_run(run_id)
+
+    @cached_property
+    def _connection(self) -> tuple["MlflowClient", str]:
+        os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+        os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")  # the default holds a call for 246 s
+        os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")  # seconds
+        from mlflow import MlflowClient
+
+        # Whatever fails in MLflow reaches us as an exception; its log would add a traceback to each.
+        logging.getLogger("mlflow").setLevel(logging.CRITICAL)
+        logging.getLogger("alembic").setLevel(logging.WARNING)
+        self._root.mkdir(parents=True, exist_ok=True)
+        with _locked(self._root / "mlflow.lock"):  # processes that make the tables together break them for good
+            if self._is_local:
+                with closing(sqlite3.connect(self._root / "mlflow.db")) as database:
+                    database.execute("PRAGMA journal_mode=WAL")  # else one slow reader makes a write fail
+            client = MlflowClient(self.uri)
+            if experiment := client.get_experiment_by_name(self._experiment):
+                return client, experiment.experiment_id
+            # MLflow's own choice would depend on the working directory of whoever comes first.
+            location = (self._root / "artifacts" / self._experiment).as_uri() if self._is_local else None
+            return client, client.create_experiment(self._experiment, location)
+
+
+class Publisher:
+    """A thread that keeps MLflow up to date with a run folder's commits and never disturbs the run.
+
+    It looks at the folder every `interval` seconds; while MLflow fails, less and less often, down to once a minute.
+    """
+
+    def __init__(self, folder: Path, store: Store, interval: float = 5.0) -> None:
+        self._folder = folder
+        self._store = store
+        self._interval = interval
+        self._draining = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="publisher", daemon=True)
+        self._thread.start()
+
+    def drain(self, timeout: float) -> bool:
+        """Publishes what is committed by now and stops; False if that took more than `timeout` seconds.
+
+        What is left then is published while the process lives, and by `publish` later.
+        """
+        self._draining.set()
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        delay, failing = self._interval, False
+        while True:
+            draining = self._draining.is_set()  # asked first: what is committed before a drain is published by it
+            try:
+                publish(self._folder, self._store)
+            except Exception as error:
+                if not failing:
+                    reason = f"{type(error).__name__}: {error}".partition("\n")[0]
+                    _log.warning("Publishing to MLflow fails (%s); the run goes on and is published later", reason)
+                delay, failing = min(2 * delay, 60.0), True
+            else:
+                if failing:
+                    _log.warning("Publishing to MLflow works again and is up to date")
+                delay, failing = self._interval, False
+                if draining:
+                    return
+            if draining:
+                time.sleep(1.0)
+            else:
+                self._draining.wait(delay)
+
+
+def publish(folder: Path, store: Store) -> None:
+    """Brings the MLflow run of a folder up to the folder's last commit.
+
+    May be repeated, interrupted, and run by several processes at once without doubling anything. How far it came stands
+    in `published.json`; without that file everything is sent again. Lines are sent in their order, so a step never runs
+    backwards. Infinite values are left out (MLflow would show 1.8e308; the journal has them), NaN is kept. A file that
+    is gone is passed over with a warning. A param that changes once MLflow has it, as final there, becomes a tag.
+
+    Raises:
+        ValueError: on a damaged journal.
+        MlflowException, OSError, sqlite3.Error: when MLflow cannot be reached; what is missing stays to be published.
+    """
+    folder = folder.resolve()
+    with _locked(folder / "published.lock"):
+        commit = read_commit(folder)
+        if commit is None:
+            return
+        cursor = _Cursor.of(folder, store, commit)
+        if (cursor.offset, cursor.status) == (commit.offset, commit.status):
+            return
+        mirror = _Mirror(folder, store, cursor.run_id)
+        points: list[Metric] = []
+        for offset, record in read(folder, cursor.offset, commit.offset):
+            if isinstance(record, Metrics):
+                points += mirror.unsent(record)
+                if len(points) < _POINTS and offset < commit.offset:
+                    continue
+            mirror.send_points(points)
+            points.clear()
+            if not isinstance(record, Metrics):
+                mirror.send(record)
+            cursor = replace(cursor, offset=offset)
+            cursor.save(folder)
+        mirror.send_status(commit)
+        replace(cursor, status=commit.status).save(folder)
+
+
+@dataclass(frozen=True)
+class _Cursor:
+    """How far a folder is published, where to, and as which run."""
+
+    store: str
+    identity: str
+    run_id: str
+    offset: int = 0
+    status: str = ""
+
+    @classmethod
+    def of(cls, folder: Path, store: Store, commit: Commit) -> "_Cursor":
+        """Returns the folder's cursor in this store, at the start of a found or new run if there is none."""
+        path = folder / "published.json"
+        if path.exists():
+            cursor = cls(**json.loads(path.read_bytes()))
+            if (cursor.store, cursor.identity) == (store.address, commit.identity):
+                return cursor
+            if cursor.store == store.address:
+                store.delete_run(cursor.run_id)  # it shows lines that the journal has taken back
+        cursor = cls(store.address, commit.identity, store.open_run(folder, commit))
+        cursor.save(folder)
+        return cursor
+
+    def save(self, folder: Path) -> None:
+        write_file(folder / "published.json", json.dumps(asdict(self)).encode())
+
+
+class _Mirror:
+    """Sends records of one folder to one run; every method may be repeated."""
+
+    def __init__(self, folder: Path, store: Store, run_id: str) -> None:
+        self._artifacts = folder / "artifacts"
+        self._client = store.client
+        self._experiment_id = store.experiment_id
+        self._run_id = run_id
+        self._latest = {point.key: point.timestamp for point in self._client.get_run(run_id).data._metric_objs}
+
+    def unsent(self, record: Metrics) -> "list[Metric]":
+        """Returns a record's points but for those that MLflow is sure to have.
+
+        Points go out in the order of their time, so MLflow has all that precede the latest one of their key. Sending
+        those again would be harmless but slow: MLflow looks each up, in 10 ms among 240,000 points.
+        """
+        return [point for point in self._points(record) if point.timestamp >= self._latest.get(point.key, 0)]
+
+    def _points(self, record: Metrics | Model, model_id: str | None = None) -> "list[Metric]":
+        from mlflow.entities import Metric
+
+        return [
+            Metric(key, value, record.time, record.step, model_id=model_id, run_id=self._run_id)
+            for key, value in record.values.items()
+            if not math.isinf(value)
+        ]
+
+    def send_points(self, points: "list[Metric]") -> None:
+        self._client.log_batch(self._run_id, metrics=points, synchronous=True)
+
+    def send_status(self, commit: Commit) -> None:
+        if commit.status == "RUNNING":
+            self._client.update_run(self._run_id, commit.status)
+        else:
+            self._client.set_terminated(self._run_id, commit.status, commit.updated)
+
+    def send(self, record: Params | Tags | Artifact | Image | Model) -> None:
+        if isinstance(record, Artifact | Image | Model) and not (self._artifacts / record.path).exists():
+            _log.warning("%s is gone and cannot be published", self._artifacts / record.path)
+            return
+        match record:
+            case Params(values):
+                self._send_params(values)
+            case Tags(values):
+                self._send_tags(values)
+            case Artifact(path):
+                self._client.log_artifact(self._run_id, str(self._artifacts / path), os.path.dirname(path))
+            case Image():
+                self._send_image(record)
+            case Model():
+                self._send_model(record)
+
+    def _send_params(self, values: dict[str, str]) -> None:
+        from mlflow.entities import Param
+
+        values = {key: value[:_PARAM_LENGTH] for key, value in values.items()}
+        final = self._client.get_run(self._run_id).data.params
+        params = [Param(key, value) for key, value in values.items() if key not in final]
+        self._client.log_batch(self._run_id, params=params, synchronous=True)
+        self._send_tags({key: value for key, value in values.items() if final.get(key, value) != value})
+
+    def _send_tags(self, values: dict[str, str]) -> None:
+        for key, value in values.items():
+            self._client.set_tag(self._run_id, key, value, synchronous=True)
+
+    def _send_image(self, record: Image) -> None:
+        # `log_image` with a key would name the files at random, so that an image sent again would be a second one.
+        from mlflow.tracking.multimedia import compress_image_size
+        from PIL.Image import open as open_image
+
+        unique = uuid5(UUID(self._run_id), record.path)
+        name = f"images/{record.key.replace('/', '~')}+step+{record.step}+timestamp+{record.time}+{unique}"
+        with open_image(self._artifacts / record.path) as image:
+            self._client.log_image(self._run_id, image, f"{name}.png")
+            self._client.log_image(self._run_id, compress_image_size(image), f"{name}+compressed.webp")
+        self._send_tags({"mlflow.loggedImages": "True"})
+
+    def _send_model(self, record: Model) -> None:
+        from mlflow.entities import LoggedModelOutput
+
+        same = f"source_run_id = '{self._run_id}' AND name = '{record.name}' AND tags.step = '{record.step}'"
+        found = self._client.search_logged_models([self._experiment_id], same, max_results=1)
+        tags = {"step": str(record.step)}
+        create = self._client.create_logged_model
+        model_id = (found[0] if found else create(self._experiment_id, record.name, self._run_id, tags)).model_id
+        self._client.log_model_artifact(model_id, str(self._artifacts / record.path))
+        self._client.finalize_logged_model(model_id, "READY")
+        outputs = self._client.get_run(self._run_id).outputs
+        if not outputs or model_id not in {output.model_id for output in outputs.model_outputs}:
+            self._client.log_outputs(self._run_id, [LoggedModelOutput(model_id, record.step)])
+        self.send_points(self._points(record, model_id))
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    with open(path, "w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        try:
+            yield
+        finally:
+            fcntl.flock(file, fcntl.LOCK_UN)  # closing alone would leave it with a process forked meanwhile

@@ -1,0 +1,175 @@
+"""Checkpoints: the state of a whole training, written so that a crash at any moment leaves the last whole one."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
+import safetensors.torch
+import torch
+from safetensors import SafetensorError
+
+from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.tracking.journal import write_file
+
+FORMAT = 1
+_KEPT = 2  # generations
+
+
+class CheckpointError(RuntimeError):
+    """No checkpoint that could be continued from, although there is one; says which and why."""
+
+
+class Checkpoints:
+    """Generations of a training's state under a folder; the two newest are kept.
+
+    A generation is a folder with `state.json` (the tree, with a place for each array), `tensors.safetensors` and
+    `arrays.safetensors`. The replay memory lies beside them in segments that are written once and shared: a save adds
+    only what came since the last one. A generation counts from the moment its `manifest.json`, which holds the
+    checksum of every file, is in place. `identity` is the experiment that the state belongs to.
+    """
+
+    def __init__(self, folder: Path, identity: str) -> None:
+        self.folder = folder
+        self.identity = identity
+        self._segments: list[dict[str, Any]] = []  # of the memory, oldest first: name, sha256, next_id
+        self._generation = 0
+
+    def save(self, state: Mapping[str, Any], memory: ReplayMemory) -> None:
+        """Write a generation. Raises: OSError, with the generations before it intact."""
+        segments = [entry for entry in self._segments if entry["next_id"] > memory.oldest_id]
+        since = segments[-1]["next_id"] if segments else memory.oldest_id
+        if memory.next_id > since:
+            name = f"segments/{since:012d}-{memory.next_id:012d}"
+            checksums = self._write(name, memory.segment(since))
+            segments.append({"name": name, "next_id": memory.next_id, "sha256": checksums})
+        generation = self._generation + 1
+        # What a crash left here is not covered by a manifest.
+        shutil.rmtree(self.folder / _name(generation), ignore_errors=True)
+        manifest = {
+            "format": FORMAT,
+            "identity": self.identity,
+            "segments": segments,
+            "state": self._write(_name(generation), state),
+        }
+        write_file(self.folder / _name(generation) / "manifest.json", json.dumps(manifest).encode())
+        self._segments, self._generation = segments, generation
+        self._clean()
+
+    def load(
+        self, memory: ReplayMemory | None = None, warn: Callable[[str], None] = lambda _: None
+    ) -> dict[str, Any] | None:
+        """The newest whole generation's state; None where nothing was ever saved. Restores `memory` if there is one.
+
+        A damaged generation is passed over with a call of `warn`, which gets one line.
+
+        Raises:
+            CheckpointError: if all generations are damaged, or the newest is of another experiment or a newer format.
+        """
+        faults = []
+        for generation in sorted(self._generations(), reverse=True):
+            try:
+                manifest = json.loads((self.folder / _name(generation) / "manifest.json").read_bytes())
+                self._refuse_foreign(manifest, generation)
+                state = self._read(_name(generation), manifest["state"])
+                segments = manifest["segments"]
+                if memory is not None:
+                    memory.load_segments(self._read(entry["name"], entry["sha256"]) for entry in segments)
+            except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
+                faults.append(f"checkpoint {generation} in {self.folder} is damaged ({error})")
+                warn(faults[-1])
+                continue
+            self._segments, self._generation = segments, generation
+            return state
+        if faults:
+            raise CheckpointError(f"{faults[0]}, and no older one is whole")
+        return None
+
+    def _refuse_foreign(self, manifest: Mapping[str, Any], generation: int) -> None:
+        if manifest["format"] > FORMAT:
+            raise CheckpointError(
+                f"checkpoint {generation} in {self.folder} has format {manifest['format']}, "
+                f"this version reads up to {FORMAT}: upgrade atlantis_exp"
+            )
+        if manifest["identity"] != self.identity:
+            raise CheckpointError(
+                f"checkpoint {generation} in {self.folder} belongs to experiment {manifest['identity']}, "
+                f"not to {self.identity}"
+            )
+
+    def _generations(self) -> list[int]:
+        folders = self.folder.glob("[0-9]*/manifest.json")
+        return [int(path.parent.name) for path in folders if path.parent.name.isdecimal()]
+
+    def _write(self, name: str, tree: Mapping[str, Any]) -> dict[str, str]:
+        """Write a state tree as files of a new folder; returns their checksums."""
+        tensors: dict[str, torch.Tensor] = {}
+        arrays: dict[str, np.ndarray[Any, Any]] = {}
+        files = {"state.json": json.dumps(_disassemble(tree, "", tensors, arrays)).encode()}
+        if tensors:
+            files["tensors.safetensors"] = safetensors.torch.save(tensors)
+        if arrays:
+            files["arrays.safetensors"] = safetensors.numpy.save(arrays)
+        for file, content in files.items():
+            write_file(self.folder / name / file, content)
+        return {file: hashlib.sha256(content).hexdigest() for file, content in files.items()}
+
+    def _read(self, name: str, checksums: Mapping[str, str]) -> dict[str, Any]:
+        if not set(checksums) <= {"state.json", "tensors.safetensors", "arrays.safetensors"} or ".." in name:
+            raise ValueError("its manifest names files that no checkpoint has")
+        contents = {file: (self.folder / name / file).read_bytes() for file in checksums}
+        for file, content in contents.items():
+            if hashlib.sha256(content).hexdigest() != checksums[file]:
+                raise ValueError(f"{name}/{file} does not have its checksum")
+        tensors = safetensors.torch.load(contents["tensors.safetensors"]) if "tensors.safetensors" in contents else {}
+        arrays = safetensors.numpy.load(contents["arrays.safetensors"]) if "arrays.safetensors" in contents else {}
+        tree: dict[str, Any] = _assemble(json.loads(contents["state.json"]), tensors, arrays)
+        return tree
+
+    def _clean(self) -> None:
+        """Remove generations beyond the kept ones, and segments that no kept one names."""
+        generations = sorted(self._generations())
+        for generation in generations[:-_KEPT]:
+            shutil.rmtree(self.folder / _name(generation), ignore_errors=True)
+        named = set()
+        for generation in generations[-_KEPT:]:
+            manifest = json.loads((self.folder / _name(generation) / "manifest.json").read_bytes())
+            named |= {entry["name"] for entry in manifest["segments"]}
+        for path in self.folder.glob("segments/*"):
+            if f"segments/{path.name}" not in named:
+                shutil.rmtree(path, ignore_errors=True)
+
+
+def _name(generation: int) -> str:
+    return f"{generation:08d}"
+
+
+def _disassemble(
+    node: Any, path: str, tensors: dict[str, torch.Tensor], arrays: dict[str, np.ndarray[Any, Any]]
+) -> Any:
+    """The tree with every tensor and array moved into its table, under the path it was found at."""
+    if isinstance(node, torch.Tensor):
+        tensors[path] = node.detach().contiguous()
+        return {"$tensor": path}
+    if isinstance(node, np.ndarray):
+        arrays[path] = np.ascontiguousarray(node)
+        return {"$array": path, "shape": list(node.shape)}
+    if isinstance(node, Mapping):
+        prefix = f"{path}." if path else ""
+        return {key: _disassemble(value, f"{prefix}{key}", tensors, arrays) for key, value in node.items()}
+    return node
+
+
+def _assemble(node: Any, tensors: Mapping[str, torch.Tensor], arrays: Mapping[str, np.ndarray[Any, Any]]) -> Any:
+    if not isinstance(node, dict):
+        return node
+    if "$tensor" in node:
+        return tensors[node["$tensor"]]
+    if "$array" in node:
+        # ascontiguousarray has made vectors of scalars.
+        return arrays[node["$array"]].reshape(node["shape"])
+    return {key: _assemble(value, tensors, arrays) for key, value in node.items()}

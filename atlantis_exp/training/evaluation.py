@@ -1,0 +1,177 @@
+"""Evaluation: episodes at a fixed epsilon, on their own emulators and random streams (report figure 3.3)."""
+
+import csv
+import io
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from atlantis_exp.game.emulator import ACTIONS, Emulator
+from atlantis_exp.game.preprocessing import FrameStack
+from atlantis_exp.game.vector import Emulators
+from atlantis_exp.statistics import Summary, summarize
+from atlantis_exp.training.actor import Actor
+
+
+@dataclass
+class Episode:
+    """One evaluated episode; its seed and actions are all that is needed to see it again."""
+
+    seed: int
+    score: float = 0.0
+    frames: int = 0
+    truncated: bool = False
+    actions: bytearray = field(default_factory=bytearray)  # one a step
+    random: bytearray = field(default_factory=bytearray)  # 1 where chance chose
+
+    @property
+    def steps(self) -> int:
+        """Decisions in the episode."""
+        return len(self.actions)
+
+    @property
+    def random_share(self) -> float:
+        """Share of the decisions that chance took."""
+        return sum(self.random) / self.steps
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The episodes of one evaluation, in the order of their seeds."""
+
+    epsilon: float
+    episodes: list[Episode]
+
+    @cached_property
+    def summary(self) -> Summary:
+        """The score distribution."""
+        return summarize([episode.score for episode in self.episodes])
+
+    @property
+    def best(self) -> Episode:
+        """The first of the episodes with the highest score."""
+        return max(self.episodes, key=lambda episode: episode.score)
+
+    @cached_property
+    def action_counts(self) -> npt.NDArray[np.int64]:
+        """How often each action was chosen, (actions, 2): by the network, by chance."""
+        counts = np.zeros((len(ACTIONS), 2), np.int64)
+        for episode in self.episodes:
+            np.add.at(counts, (np.frombuffer(episode.actions, np.uint8), np.frombuffer(episode.random, np.uint8)), 1)
+        return counts
+
+    @property
+    def random_share(self) -> float:
+        """Share of all decisions that chance took."""
+        return float(self.action_counts[:, 1].sum() / self.action_counts.sum())
+
+    def metrics(self) -> dict[str, float]:
+        """Everything in one number each, under `evaluation/` and `actions/`."""
+        summary = self.summary
+        shares = self.action_counts.sum(axis=1) / self.action_counts.sum()
+        return {
+            "evaluation/mean": summary.mean,
+            "evaluation/median": summary.median,
+            "evaluation/high": summary.high,
+            "evaluation/low": summary.low,
+            "evaluation/lower_quartile": summary.lower_quartile,
+            "evaluation/upper_quartile": summary.upper_quartile,
+            "evaluation/interquartile_mean": summary.interquartile_mean,
+            "evaluation/standard_error": summary.standard_error,
+            "evaluation/episodes": summary.episodes,
+            "evaluation/epsilon": self.epsilon,
+            "evaluation/steps_mean": float(np.mean([episode.steps for episode in self.episodes])),
+            "evaluation/truncated_share": float(np.mean([episode.truncated for episode in self.episodes])),
+            "actions/random_share": self.random_share,
+            "actions/network_share": 1 - self.random_share,
+            "actions/random_share_best": self.best.random_share,
+            "actions/network_share_best": 1 - self.best.random_share,
+            **{f"actions/{action}": float(share) for action, share in zip(ACTIONS, shares, strict=True)},
+        }
+
+    def table(self) -> str:
+        """A CSV line an episode."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(("episode", "seed", "score", "steps", "frames", "truncated", "random", *ACTIONS))
+        for index, episode in enumerate(self.episodes):
+            counts = np.bincount(np.frombuffer(episode.actions, np.uint8), minlength=len(ACTIONS))
+            ends = (episode.steps, episode.frames, int(episode.truncated), sum(episode.random))
+            writer.writerow((index, episode.seed, episode.score, *ends, *counts.tolist()))
+        return text.getvalue()
+
+    def report(self) -> str:
+        """The evaluation as the report prints it (figures 5.4, 5.5 and 5.9)."""
+        summary, best = self.summary, self.best
+        return (
+            f"eval:\n\n"
+            f"avg score: {summary.mean}  high score: {summary.high}  low score: {summary.low}\n\n"
+            f"interquartile range ({summary.lower_quartile} -> {summary.upper_quartile}) "
+            f"mean = {summary.interquartile_mean:.2f}\n\n"
+            f"high score: {best.score}, rand: {best.random_share:.1%} neural net: {1 - best.random_share:.1%}"
+        )
+
+
+def evaluate(
+    actor: Actor,
+    emulators: Emulators,
+    *,
+    episodes: int,
+    epsilon: float,
+    seed: int,
+    size: int,
+    stack: int,
+    on_episode: Callable[[Episode], None] = lambda _: None,
+) -> Evaluation:
+    """Play `episodes` episodes side by side; what each is like depends on `seed` and its own index alone.
+
+    size in pixels and stack in observations, as the actor's states want them.
+    """
+    played = [Episode(_seed_sequence(seed, index).generate_state(1).item()) for index in range(episodes)]
+    streams = [np.random.default_rng(_seed_sequence(seed, index).spawn(1)[0]) for index in range(episodes)]
+    stacks = FrameStack(emulators.num_envs, size, stack)
+    waiting = iter(range(episodes))
+    playing: dict[int, int] = {}  # environment to the episode it plays
+
+    def begin(env: int) -> None:
+        index = next(waiting, None)
+        if index is None:
+            playing.pop(env, None)
+        else:
+            playing[env] = index
+            stacks.reset([env], emulators.reset([env], [played[index].seed]))
+
+    for env in range(min(emulators.num_envs, episodes)):
+        begin(env)
+    while playing:
+        envs = np.array(sorted(playing))
+        decisions = actor.act(stacks.state[envs], epsilon, [streams[playing[env]] for env in envs])
+        steps = emulators.step(decisions.actions, envs)
+        stacks.push(steps.observations, envs)
+        for row, env in enumerate(envs.tolist()):
+            episode = played[playing[env]]
+            episode.actions.append(int(decisions.actions[row]))
+            episode.random.append(bool(decisions.random[row]))
+            episode.score += float(steps.rewards[row])
+            episode.frames += int(steps.frames[row])
+            if steps.terminated[row] or steps.truncated[row]:
+                episode.truncated = bool(steps.truncated[row])
+                on_episode(episode)
+                begin(env)
+    return Evaluation(epsilon, played)
+
+
+def replay(episode: Episode, emulator: Emulator) -> Iterator[npt.NDArray[np.uint8]]:
+    """Play an episode again from its seed and actions; yields its screens, (210, 160, 3) uint8, one a step."""
+    emulator.reset(episode.seed)
+    yield emulator.screen_rgb()
+    for action in episode.actions:
+        emulator.step(action)
+        yield emulator.screen_rgb()
+
+
+def _seed_sequence(seed: int, index: int) -> np.random.SeedSequence:
+    return np.random.SeedSequence(seed, spawn_key=(index,))

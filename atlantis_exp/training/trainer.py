@@ -1,0 +1,374 @@
+"""The training loop (report figure 3.1), as a page that reads like it."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal
+
+import numpy as np
+import safetensors.torch
+
+from atlantis_exp.game.preprocessing import FrameStack
+from atlantis_exp.game.vector import Emulators, Steps
+from atlantis_exp.learning.learner import Learner
+from atlantis_exp.learning.schedules import Schedule
+from atlantis_exp.media import film, score_histogram
+from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.replay.samplers import Sampler
+from atlantis_exp.tracking.journal import Tracker
+from atlantis_exp.training.actor import Actor, Decisions
+from atlantis_exp.training.checkpoint import Checkpoints
+from atlantis_exp.training.evaluation import Evaluation
+from atlantis_exp.training.progress import Progress
+
+Unit = Literal["episodes", "steps"]
+Outcome = Literal["finished", "budget", "interrupted"]
+
+
+class Diverged(RuntimeError):
+    """The loss was no finite number; the last commit is from before."""
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of training with its own learning rate and sampler."""
+
+    name: str
+    length: int  # in the plan's unit
+    learning_rate: float
+    sampler: Sampler
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is trained when: phases one after the other, all measured in episodes or all in steps."""
+
+    unit: Unit
+    phases: Sequence[Phase]
+    epsilon: Schedule  # of progress
+    learn_every: int  # steps
+    learn_start: int  # transitions in the memory
+    batch_size: int  # transitions
+
+    @property
+    def length(self) -> int:
+        """Of all phases together, in the plan's unit."""
+        return sum(phase.length for phase in self.phases)
+
+    def phase_at(self, done: int) -> Phase:
+        """The phase after `done` units; the last one keeps what comes after it."""
+        for phase in self.phases:
+            done -= phase.length
+            if done < 0:
+                return phase
+        return self.phases[-1]
+
+
+@dataclass(frozen=True)
+class Cadence:
+    """How often things are written down, all of it without influence on what is learned."""
+
+    curve_steps: int  # steps between two points of a curve
+    histogram_episodes: int  # episodes in a window's histogram
+    commit_episodes: int  # episodes between two commits
+    commit_seconds: float  # seconds between two commits at the most
+    evaluate_episodes: int | None  # training episodes between two evaluations
+    evaluate_steps: int | None  # training steps between two evaluations
+    evaluate_at_end: bool
+
+
+@dataclass
+class Counters:
+    """What was done so far, over all sessions."""
+
+    steps: int = 0
+    frames: int = 0
+    episodes: int = 0
+    random: int = 0  # decisions that chance took
+    learn_ticks: int = 0  # multiples of learn_every that have passed
+    seconds: float = 0.0
+
+
+class Trainer:
+    """One run: built parts in, `run` until the plan, the budget or a stop request ends it.
+
+    With one environment the loop is the report's, one thing after the other. With several, the updates that are due
+    run while the emulators play; what is done, and in which order it takes effect, never depends on timing.
+    """
+
+    def __init__(
+        self,
+        *,
+        plan: Plan,
+        cadence: Cadence,
+        emulators: Emulators,
+        stack: FrameStack,
+        actor: Actor,
+        memory: ReplayMemory,
+        learner: Learner,
+        exploration: Sequence[np.random.Generator],
+        sampling: np.random.Generator,
+        seeds: Sequence[int],
+        tracker: Tracker,
+        checkpoints: Checkpoints,
+        evaluate: Callable[[Progress], tuple[Evaluation, bytes | None]],
+        progress: Progress,
+        max_steps: int | None,
+    ) -> None:
+        self.plan, self.cadence = plan, cadence
+        self.emulators, self.stack, self.actor = emulators, stack, actor
+        self.memory, self.learner = memory, learner
+        self.exploration, self.sampling, self.seeds = exploration, sampling, seeds
+        self.tracker, self.checkpoints, self.evaluate, self.progress = tracker, checkpoints, evaluate, progress
+        self.max_steps = max_steps
+        self.counters = Counters()
+        self.scores = np.zeros(emulators.num_envs)  # of the episodes under way
+        self.lengths = np.zeros(emulators.num_envs, np.int64)  # of the episodes under way, steps
+        self.recent_scores: deque[float] = deque(maxlen=max(100, cadence.histogram_episodes))
+        self.recent_lengths: deque[int] = deque(maxlen=100)  # steps
+        self.best_mean = -np.inf  # of all evaluations
+        self.evaluated_at = -1  # steps
+        self.best_step = -1
+        self.last_report = ""  # of the latest evaluation
+        self.last_metrics: dict[str, float] = {}  # of the latest evaluation
+
+    def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
+        """Train from where the counters stand; commits before it returns.
+
+        Raises:
+            Diverged: when the loss is no finite number; nothing is committed then.
+            WorkerDied: when an emulator's process has ended.
+            OSError: when a commit cannot be written; the last one stays.
+        """
+        if self.counters.steps == 0:
+            self._begin_all()
+        self._session_start = time.monotonic() - self.counters.seconds
+        self._last_commit = time.monotonic()
+        while not self._ended and not stop():
+            self._iterate()
+        if not self._ended:
+            self.commit()
+            return "interrupted"
+        if self.cadence.evaluate_at_end and self.evaluated_at != self.counters.steps:
+            self._evaluate()
+        self.commit()
+        return "finished" if self.done >= self.plan.length else "budget"
+
+    @property
+    def phase(self) -> Phase:
+        """The phase under way."""
+        return self.plan.phase_at(self.done)
+
+    @property
+    def epsilon(self) -> float:
+        """The probability that chance takes the next decision."""
+        # The report counts the episode under way as one: its first has epsilon(1), not epsilon(0).
+        running = 1 if self.plan.unit == "episodes" else 0
+        return self.plan.epsilon((self.done + running) / self.plan.length)
+
+    def commit(self) -> None:
+        """Make the checkpoint and all metrics up to it durable together, then visible."""
+        self.counters.seconds = time.monotonic() - self._session_start
+        if (update := self.learner.first_nonfinite_update()) is not None:
+            raise Diverged(f"the loss of update {update} is no finite number; the run stays at its last commit")
+        self.checkpoints.save(self.state_dict(), self.memory)
+        self.tracker.commit()
+        self._last_commit = time.monotonic()
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "counters": asdict(self.counters),
+            "learner": self.learner.state_dict(),
+            "emulators": self.emulators.state_dict(),
+            "stack": self.stack.state_dict(),
+            "exploration": [generator.bit_generator.state for generator in self.exploration],
+            "sampling": self.sampling.bit_generator.state,
+            "scores": self.scores,
+            "lengths": self.lengths,
+            "recent_scores": list(self.recent_scores),
+            "recent_lengths": list(self.recent_lengths),
+            "best_mean": None if np.isinf(self.best_mean) else self.best_mean,
+            "evaluated_at": self.evaluated_at,
+            "best_step": self.best_step,
+            "last_report": self.last_report,
+            "last_metrics": self.last_metrics,
+            "tracker": self.tracker.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self.counters = Counters(**{field.name: state["counters"][field.name] for field in fields(Counters)})
+        self.learner.load_state_dict(state["learner"])
+        self.emulators.load_state_dict(state["emulators"])
+        self.stack.load_state_dict(state["stack"])
+        for generator, generator_state in zip(self.exploration, state["exploration"], strict=True):
+            generator.bit_generator.state = generator_state
+        self.sampling.bit_generator.state = state["sampling"]
+        self.scores, self.lengths = state["scores"], state["lengths"]
+        self.recent_scores.extend(state["recent_scores"])
+        self.recent_lengths.extend(state["recent_lengths"])
+        self.best_mean = -np.inf if state["best_mean"] is None else state["best_mean"]
+        self.evaluated_at = state["evaluated_at"]
+        self.best_step = state["best_step"]
+        self.last_report, self.last_metrics = state["last_report"], state["last_metrics"]
+        self.tracker.load_state_dict(state["tracker"])
+
+    @property
+    def done(self) -> int:
+        return self.counters.episodes if self.plan.unit == "episodes" else self.counters.steps
+
+    @property
+    def _ended(self) -> bool:
+        budget_spent = self.max_steps is not None and self.counters.steps >= self.max_steps
+        return budget_spent or self.done >= self.plan.length
+
+    def _begin_all(self) -> None:
+        envs = range(self.emulators.num_envs)
+        observations = self.emulators.reset(envs, self.seeds)
+        self.stack.reset(envs, observations)
+        for env in envs:
+            self.memory.begin(env, observations[env])
+
+    def _iterate(self) -> None:
+        """One step of every environment, and the updates that fall due."""
+        overlap = self.emulators.num_envs > 1
+        self.learner.learning_rate = self.phase.learning_rate
+        decisions = self.actor.act(self.stack.state, self.epsilon, self.exploration)
+        self.emulators.send(decisions.actions)
+        if overlap:
+            self._learn()
+        steps = self.emulators.receive()
+        self._observe(decisions, steps)
+        if not overlap:
+            self._learn()
+        self._write_down(steps)
+
+    def _learn(self) -> None:
+        due = self.counters.steps // self.plan.learn_every - self.counters.learn_ticks
+        self.counters.learn_ticks += due
+        if len(self.memory) <= self.plan.learn_start:
+            return
+        for _ in range(due):
+            ids = self.phase.sampler.sample(self.memory, self.plan.batch_size, self.sampling)
+            self.learner.update(*self.memory.gather(ids))
+
+    def _observe(self, decisions: Decisions, steps: Steps) -> None:
+        self.stack.push(steps.observations)
+        for env in range(self.emulators.num_envs):
+            self.memory.add(
+                env,
+                int(decisions.actions[env]),
+                float(steps.rewards[env]),
+                steps.observations[env],
+                bool(steps.terminated[env]),
+            )
+        self.counters.steps += self.emulators.num_envs
+        self.counters.frames += int(steps.frames.sum())
+        self.counters.random += int(decisions.random.sum())
+        self.scores += steps.rewards
+        self.lengths += 1
+
+    def _write_down(self, steps: Steps) -> None:
+        before = self.counters.steps - self.emulators.num_envs
+        for env in np.flatnonzero(steps.terminated | steps.truncated).tolist():
+            self._end_episode(env)
+        if _passed(self.cadence.curve_steps, before, self.counters.steps):
+            self._record_curves()
+        if _passed(self.cadence.evaluate_steps, before, self.counters.steps):
+            self._evaluate()
+        self.counters.seconds = time.monotonic() - self._session_start
+        self.progress.update(self)
+        if time.monotonic() - self._last_commit >= self.cadence.commit_seconds:
+            self.commit()
+
+    def _end_episode(self, env: int) -> None:
+        score, length = float(self.scores[env]), int(self.lengths[env])
+        self.scores[env], self.lengths[env] = 0.0, 0
+        self.recent_scores.append(score)
+        self.recent_lengths.append(length)
+        self.counters.episodes += 1
+        episodes = self.counters.episodes
+        self.tracker.metrics(
+            {
+                "score/episode": score,
+                "score/mean_20": float(np.mean(list(self.recent_scores)[-20:])),
+                "score/length": length,
+                "score/length_mean_100": float(np.mean(self.recent_lengths)),
+                "throughput/episodes": episodes,
+            },
+            self.counters.steps,
+        )
+        observation = self.emulators.reset([env])
+        self.stack.reset([env], observation)
+        self.memory.begin(env, observation[0])
+
+        if episodes % self.cadence.histogram_episodes == 0:
+            window = list(self.recent_scores)[-self.cadence.histogram_episodes :]
+            title = f"training, episodes {episodes - len(window) + 1}-{episodes}"
+            self.tracker.image("score/histogram", score_histogram(window, title), self.counters.steps)
+        if self.cadence.evaluate_episodes and episodes % self.cadence.evaluate_episodes == 0:
+            self._evaluate()
+        if episodes % self.cadence.commit_episodes == 0:
+            self.commit()
+
+    def _record_curves(self) -> None:
+        # The last multiple, not the step itself: curves of runs with different num_envs then share their grid.
+        step = self.counters.steps - self.counters.steps % self.cadence.curve_steps
+        measures = {f"learning/{name}": value for name, value in self.learner.statistics().items()}
+        if (update := self.learner.first_nonfinite_update()) is not None:
+            raise Diverged(f"the loss of update {update} is no finite number; the run stays at its last commit")
+        if self.recent_scores:
+            last = list(self.recent_scores)[-100:]
+            measures |= {"score/mean_100": float(np.mean(last)), "score/best_100": max(last)}
+        self.tracker.metrics(
+            {
+                **measures,
+                "actions/exploration_share": self.counters.random / self.counters.steps,
+                "actions/epsilon": self.epsilon,
+                "learning/learning_rate": self.learner.learning_rate,
+                "learning/updates": self.learner.updates,
+                "learning/phase": self.plan.phases.index(self.phase),
+                "throughput/frames": self.counters.frames,
+                "throughput/episodes": self.counters.episodes,
+                "throughput/memory": len(self.memory),
+                "throughput/memory_bytes": self.memory.nbytes,
+                "throughput/steps_per_second": self.progress.steps_per_second,
+                "throughput/hours": self.counters.seconds / 3600,
+            },
+            step,
+        )
+
+    def _evaluate(self) -> None:
+        step = self.counters.steps
+        if step == self.evaluated_at:
+            return
+        evaluation, video = self.evaluate(self.progress)
+        metrics = {**evaluation.metrics(), "throughput/episodes": self.counters.episodes}
+        self.tracker.metrics(metrics, step)
+        scores = [episode.score for episode in evaluation.episodes]
+        title = f"evaluation, step {step:,}"
+        self.tracker.image("evaluation/histogram", score_histogram(scores, title), step)
+        self.tracker.artifact(f"evaluation/{step:09d}.csv", evaluation.table().encode())
+        self.tracker.artifact(f"evaluation/{step:09d}.txt", evaluation.report().encode())
+        weights = safetensors.torch.save(
+            {name: tensor.contiguous() for name, tensor in self.learner.network.state_dict().items()}
+        )
+        results = {name: value for name, value in metrics.items() if name.startswith("evaluation/")}
+        self.tracker.model("network", weights, step, results)
+        if evaluation.summary.mean > self.best_mean:
+            self.best_mean, self.best_step = evaluation.summary.mean, step
+            self.tracker.artifact("best.safetensors", weights)
+            self.tracker.tags({"best_evaluation": f"mean {evaluation.summary.mean:,.0f} at step {step}"})
+            if video is not None:
+                self.tracker.artifact("best_episode.mp4", video)
+        self.evaluated_at, self.last_report, self.last_metrics = step, evaluation.report(), metrics
+        self.progress.evaluated(self, evaluation)
+
+
+def film_of(screens: Any, frames: int, steps: int) -> bytes:
+    """The film of an episode at the game's own speed of 60 frames a second, on average."""
+    return film(screens, 60 * steps / frames)
+
+
+def _passed(every: int | None, before: int, now: int) -> bool:
+    return every is not None and now // every > before // every

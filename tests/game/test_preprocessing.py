@@ -1,0 +1,183 @@
+import hashlib
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+from ale_py import ALEInterface
+from ale_py.roms import get_rom_path
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from atlantis_exp.game.preprocessing import GREY, PALETTE, FrameStack, Preprocessing
+
+Pixels = npt.NDArray[np.uint8]
+
+WHOLE_SCREEN = (0, 160, 210, 0)
+FLYING_AREA = (14, 160, 94, 0)
+ODD_CUT = (17, 151, 93, 6)
+
+
+def atlantis() -> ALEInterface:
+    ale = ALEInterface()
+    ale.setInt("random_seed", 7)
+    path = get_rom_path("atlantis")
+    assert path is not None
+    ale.loadROM(path)
+    return ale
+
+
+@pytest.fixture(scope="module")
+def played_screens() -> list[tuple[Pixels, Pixels]]:
+    """Palette indices and RGB of 30 frames, 25 apart, of a random game."""
+    ale = atlantis()
+    rng = np.random.default_rng(0)
+    screens = []
+    for frame in range(750):
+        ale.act(int(rng.integers(4)))
+        if frame % 25 == 24:
+            screens.append((ale.getScreen(), ale.getScreenRGB()))
+    return screens
+
+
+def preprocess_frame(screen: Pixels, exclude: tuple[int, int, int, int], output: int) -> npt.NDArray[np.float32]:
+    """Report figure 2.3, as written there."""
+    screen = cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY)  # type: ignore[assignment]
+    screen = screen[exclude[0] : exclude[2], exclude[3] : exclude[1]]
+    normalized = np.ascontiguousarray(screen, dtype=np.float32) / 255
+    return cv2.resize(normalized, (output, output), interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
+
+
+def digest(arrays: list[Pixels]) -> str:
+    return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:16]
+
+
+def test_the_palette_and_its_grey_are_those_of_ale_and_opencv_in_all_128_colours() -> None:
+    ale = atlantis()
+    rng = np.random.default_rng(0)
+    seen: set[int] = set()
+    for _ in range(5_000):
+        for _ in range(8):  # a game shows 34 colours by itself, and all of them with random bytes in its memory
+            ale.setRAM(int(rng.integers(128)), int(rng.integers(256)))
+        ale.act(int(rng.integers(4)))
+        if ale.game_over():
+            ale.reset_game()
+        colours, where = np.unique(ale.getScreen(), return_index=True)
+        if seen.issuperset(colours.tolist()):
+            continue
+        seen.update(colours.tolist())
+        rgb = ale.getScreenRGB()
+        np.testing.assert_array_equal(PALETTE[colours], rgb.reshape(-1, 3)[where])
+        np.testing.assert_array_equal(GREY[colours], ale.getScreenGrayscale().ravel()[where])
+        np.testing.assert_array_equal(GREY[colours], cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).ravel()[where])
+    assert seen == set(range(0, 256, 2))
+
+
+@pytest.mark.parametrize("crop", [WHOLE_SCREEN, FLYING_AREA, ODD_CUT])
+@pytest.mark.parametrize("size", [84, 159])
+def test_an_observation_is_within_one_grey_level_of_the_reports(
+    played_screens: list[tuple[Pixels, Pixels]], size: int, crop: tuple[int, int, int, int]
+) -> None:
+    preprocessing = Preprocessing(size, crop)
+    for screen, rgb in played_screens:
+        observation = preprocessing(screen)
+        assert observation.shape == (size, size)
+        assert observation.dtype == np.uint8
+        report = np.round(255 * preprocess_frame(rgb, crop, size))
+        assert np.abs(observation - report).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("size", "crop", "golden"),
+    [
+        (84, WHOLE_SCREEN, "6f87915380a958b6"),
+        (84, FLYING_AREA, "8222747912cf16c3"),
+        (159, WHOLE_SCREEN, "6cb60ea3b0ed4134"),
+        (159, FLYING_AREA, "48d8d8cf18193656"),
+    ],
+)
+def test_observations_of_a_known_game_stay_what_they_are(
+    played_screens: list[tuple[Pixels, Pixels]], size: int, crop: tuple[int, int, int, int], golden: str
+) -> None:
+    screens = [screen for screen, _ in played_screens]
+    assert digest(screens) == "81fcffab18c47c18", "the game itself has changed"
+    assert digest([Preprocessing(size, crop)(screen) for screen in screens]) == golden
+
+
+@given(data=st.data())
+def test_a_crop_counts_up_right_down_left_from_the_top_left(data: st.DataObject) -> None:
+    up, left = data.draw(st.integers(0, 209)), data.draw(st.integers(0, 159))
+    down, right = data.draw(st.integers(up + 1, 210)), data.draw(st.integers(left + 1, 160))
+    screen = np.random.default_rng(0).integers(0, 256, (210, 160), np.uint8)
+    grey = Preprocessing(84, (up, right, down, left)).grey(screen)
+    np.testing.assert_array_equal(grey, GREY[screen][up:down, left:right])
+
+
+@pytest.mark.parametrize("crop", [(0, 160, 211, 0), (-1, 160, 210, 0), (0, 161, 210, 0), (0, 160, 210, -1)])
+def test_a_crop_beyond_the_screen_is_refused(crop: tuple[int, int, int, int]) -> None:
+    with pytest.raises(ValueError, match="no part of a 210x160 screen"):
+        Preprocessing(84, crop)
+
+
+@pytest.mark.parametrize("crop", [(90, 160, 90, 0), (0, 80, 210, 80), (210, 160, 0, 0), (0, 0, 210, 160)])
+def test_an_empty_crop_is_refused(crop: tuple[int, int, int, int]) -> None:
+    with pytest.raises(ValueError, match="no part of a 210x160 screen"):
+        Preprocessing(84, crop)
+
+
+def frames(*values: int) -> Pixels:
+    return np.stack([np.full((2, 2), value, np.uint8) for value in values])
+
+
+def test_an_episodes_first_observation_fills_its_state() -> None:
+    stack = FrameStack(num_envs=3, size=2)
+    stack.reset([0, 1, 2], frames(1, 2, 3))
+    stack.push(frames(4, 5, 6))
+    state = stack.reset([2, 0], frames(7, 8))
+    assert state[:, :, 0, 0].tolist() == [[8, 8, 8, 8], [2, 2, 2, 5], [7, 7, 7, 7]]
+
+
+def test_a_state_never_shares_memory_with_the_next() -> None:
+    stack = FrameStack(num_envs=1, size=2)
+    state = stack.reset([0], frames(1))
+    next_state = stack.push(frames(2))
+    assert not np.shares_memory(state, next_state)
+    assert state[0, :, 0, 0].tolist() == [1, 1, 1, 1]
+    assert next_state[0, :, 0, 0].tolist() == [1, 1, 1, 2]
+
+
+operations = st.lists(
+    st.tuples(st.sampled_from(["reset", "push", "push some", "restore"]), st.permutations(range(3)), st.integers(1, 3)),
+    max_size=20,
+)
+
+
+@settings(max_examples=60)
+@given(operations=operations, depth=st.integers(1, 4))
+def test_a_frame_stack_equals_lists_of_whole_histories(
+    operations: list[tuple[str, list[int], int]], depth: int
+) -> None:
+    stack = FrameStack(3, 2, depth)
+    histories = [[0] * depth for _ in range(3)]
+    handed_out = []
+    for value, (operation, order, count) in enumerate(operations, start=1):
+        envs = tuple(order[:count])
+        if operation == "reset":
+            stack.reset(envs, frames(*(10 * value + env for env in envs)))
+            for env in envs:
+                histories[env] = [10 * value + env] * depth
+        elif operation == "restore":
+            restored = FrameStack(3, 2, depth)
+            restored.load_state_dict(stack.state_dict())
+            stack = restored
+        else:
+            envs = (0, 1, 2) if operation == "push" else envs
+            observations = frames(*(10 * value + env for env in envs))
+            stack.push(observations, None if operation == "push" else envs)
+            observations[:] = 255
+            for env in envs:
+                histories[env].append(10 * value + env)
+        handed_out.append((stack.state, [history[-depth:] for history in histories]))
+    for state, expected in handed_out:
+        assert state[:, :, 0, 0].tolist() == expected
+        assert state[:, :, 1, 1].tolist() == expected

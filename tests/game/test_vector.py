@@ -1,0 +1,259 @@
+import copy
+import functools
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from atlantis_exp.game.emulator import Emulator
+from atlantis_exp.game.preprocessing import Pixels, Preprocessing
+from atlantis_exp.game.vector import Emulators, ProcessEmulators, SerialEmulators, Steps, WorkerDied, make_emulators
+
+make = functools.partial(
+    Emulator,
+    preprocessing=Preprocessing(32, (14, 160, 94, 0)),
+    frameskip=(2, 5),
+    sticky=0.25,
+    max_frames=300,
+    max_steps=None,
+    noop_max=0,
+    max_pool=False,
+)
+
+NUM_ENVS = 3
+
+
+def assert_equal(one: Steps, other: Steps) -> None:
+    for column, others in zip(one, other, strict=True):
+        np.testing.assert_array_equal(column, others, strict=True)
+
+
+def play(emulators: Emulators, steps: int, seed: int) -> list[Steps | Pixels]:
+    """Plays at random; every third step leaves one environment out, and the order of the others is any."""
+    rng = np.random.default_rng(seed)
+    seen: list[Steps | Pixels] = []
+    for step in range(steps):
+        envs = rng.permutation(NUM_ENVS)[: 2 if step % 3 == 2 else None]
+        steps_of_envs = emulators.step(rng.integers(4, size=len(envs)), envs)
+        seen += [steps_of_envs, emulators.reset(envs[steps_of_envs.terminated | steps_of_envs.truncated])]
+    return seen
+
+
+def assert_all_equal(one: list[Steps | Pixels], other: list[Steps | Pixels]) -> None:
+    for first, second in zip(one, other, strict=True):
+        if isinstance(first, Steps):
+            assert isinstance(second, Steps)
+            assert_equal(first, second)
+        else:
+            np.testing.assert_array_equal(first, second, strict=True)
+
+
+def test_workers_change_nothing() -> None:
+    seeds = [7, 2**40, 3]
+    serial = SerialEmulators(make, NUM_ENVS)
+    first = serial.reset(range(NUM_ENVS), seeds)
+    played = play(serial, 150, seed=0)
+    state = serial.state_dict()
+    for workers in (1, 2, 3):
+        with ProcessEmulators(make, NUM_ENVS, workers) as processes:
+            np.testing.assert_array_equal(processes.reset(range(NUM_ENVS), seeds), first, strict=True)
+            assert_all_equal(play(processes, 150, seed=0), played)
+            np.testing.assert_equal(processes.state_dict(), state)
+
+
+def test_each_environment_is_its_own_emulator() -> None:
+    with SerialEmulators(make, 3) as emulators:
+        alone = [make() for _ in range(3)]
+        first = emulators.reset([2, 0, 1], seeds=[12, 10, 11])
+        np.testing.assert_array_equal(first, [alone[env].reset(seed=10 + env) for env in (2, 0, 1)])
+        for _ in range(60):
+            steps = emulators.step([1, 2, 3])
+            for env, emulator in enumerate(alone):
+                step = emulator.step(1 + env)
+                np.testing.assert_array_equal(steps.observations[env], step.observation)
+                assert tuple(column[env] for column in steps[1:]) == step[1:]
+
+
+@pytest.fixture(scope="module")
+def in_process() -> SerialEmulators:
+    return SerialEmulators(make, NUM_ENVS)
+
+
+@pytest.fixture(scope="module")
+def two_workers() -> Iterator[ProcessEmulators]:
+    with ProcessEmulators(make, NUM_ENVS, workers=2) as emulators:
+        emulators.reset(range(NUM_ENVS), seeds=range(NUM_ENVS))
+        yield emulators
+
+
+@pytest.fixture(params=["in_process", "two_workers"])
+def emulators(request: pytest.FixtureRequest) -> Emulators:
+    played: Emulators = request.getfixturevalue(request.param)
+    played.reset(range(NUM_ENVS))
+    return played
+
+
+def test_what_was_returned_is_not_overwritten(emulators: Emulators) -> None:
+    first = emulators.reset(range(NUM_ENVS))
+    steps = emulators.step([1] * NUM_ENVS)
+    kept = copy.deepcopy((first, steps))
+    play(emulators, 20, seed=1)
+    np.testing.assert_array_equal(first, kept[0])
+    assert_equal(steps, kept[1])
+
+
+def test_saved_emulators_play_on_under_any_number_of_workers(emulators: Emulators) -> None:
+    play(emulators, 40, seed=2)
+    state = emulators.state_dict()
+    played = play(emulators, 100, seed=3)
+    for restored in (emulators, SerialEmulators(make, NUM_ENVS)):
+        restored.load_state_dict(dict(reversed(state.items())))
+        assert_all_equal(play(restored, 100, seed=3), played)
+
+
+def test_a_step_can_be_sent_and_received_later(emulators: Emulators) -> None:
+    state = emulators.state_dict()
+    emulators.send([1, 2], [2, 0])
+    later = emulators.receive()
+    emulators.load_state_dict(state)
+    assert_equal(later, emulators.step([1, 2], [2, 0]))
+
+
+def test_calls_out_of_turn_are_refused(emulators: Emulators) -> None:
+    with pytest.raises(RuntimeError, match="no step was sent"):
+        emulators.receive()
+    emulators.send([0] * NUM_ENVS)
+    for call in (emulators.state_dict, lambda: emulators.reset([0]), lambda: emulators.send([0], [0])):
+        with pytest.raises(RuntimeError, match="sent and not received"):
+            call()
+    emulators.receive()
+    with pytest.raises(RuntimeError, match="no step was sent"):
+        emulators.receive()
+
+
+def test_actions_must_match_environments(emulators: Emulators) -> None:
+    with pytest.raises(ValueError, match="zip"):
+        emulators.step([0] * (NUM_ENVS + 1))
+    assert len(emulators.step([0] * NUM_ENVS).rewards) == NUM_ENVS
+
+
+def test_one_environment_or_no_worker_stays_in_this_process() -> None:
+    assert isinstance(make_emulators(make, 1, workers=2), SerialEmulators)
+    assert isinstance(make_emulators(make, 2, workers=0), SerialEmulators)
+    before = workers_of_this_process()
+    with make_emulators(make, 2, workers=3) as emulators:
+        assert isinstance(emulators, ProcessEmulators)
+        assert len(workers_of_this_process() - before) == 2
+
+
+def workers_of_this_process() -> set[int]:
+    return {child.pid for child in multiprocessing.active_children() if child.pid}
+
+
+@pytest.fixture
+def mortal() -> Iterator[tuple[ProcessEmulators, list[int]]]:
+    """Emulators and the processes of their worker 0, which plays environments 0 and 2, and worker 1."""
+    before = workers_of_this_process()
+    with ProcessEmulators(make, NUM_ENVS, workers=2) as emulators:
+        emulators.reset(range(NUM_ENVS))
+        yield emulators, sorted(workers_of_this_process() - before)
+        assert workers_of_this_process() == before
+
+
+def test_a_worker_killed_between_steps_is_named(mortal: tuple[ProcessEmulators, list[int]]) -> None:
+    emulators, (victim, _) = mortal
+    os.kill(victim, signal.SIGKILL)
+    await_end([victim])
+    with pytest.raises(WorkerDied, match=r"worker 0, environments \[0, 2\], died of SIGKILL"):
+        emulators.step([0] * NUM_ENVS)
+
+
+def test_a_worker_killed_in_a_step_is_named_and_the_others_end(mortal: tuple[ProcessEmulators, list[int]]) -> None:
+    emulators, (victim, other) = mortal
+    os.kill(victim, signal.SIGSTOP)
+    os.kill(other, signal.SIGSTOP)
+    emulators.send([0] * NUM_ENVS)
+    os.kill(victim, signal.SIGKILL)
+    with pytest.raises(WorkerDied, match=r"worker 0, environments \[0, 2\], died of SIGKILL"):
+        emulators.receive()
+
+
+def test_an_exception_in_a_worker_is_told(mortal: tuple[ProcessEmulators, list[int]]) -> None:
+    emulators, _ = mortal
+    with pytest.raises(WorkerDied, match=r"worker 0, environments \[0, 2\], died of IndexError\('list index out of"):
+        emulators.step([0, 0, 99])
+
+
+def test_what_make_raises_is_raised() -> None:
+    with pytest.raises(ValueError, match="max_pool"):
+        ProcessEmulators(functools.partial(make, max_pool=True, frameskip=1), 2, 2)
+
+
+def test_workers_leave_signals_to_the_parent(two_workers: ProcessEmulators) -> None:
+    two_workers.reset(range(NUM_ENVS))
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2):
+        for pid in workers_of_this_process():
+            os.kill(pid, number)
+        two_workers.step([0] * NUM_ENVS)
+
+
+PARENT = """
+import functools, multiprocessing, sys
+from atlantis_exp.game.emulator import Emulator
+from atlantis_exp.game.preprocessing import Preprocessing
+from atlantis_exp.game.vector import ProcessEmulators
+
+make = functools.partial(Emulator, preprocessing=Preprocessing(84, (0, 160, 210, 0)), frameskip=4, sticky=0.25,
+                         max_frames=1_000, max_steps=None, noop_max=0, max_pool=False)
+emulators = ProcessEmulators(make, 2, 2)
+emulators.reset([0, 1])
+print(*[child.pid for child in multiprocessing.active_children()], flush=True)
+"""
+
+
+def await_end(pids: list[int]) -> None:
+    deadline = time.monotonic() + 60
+    for pid in pids:
+        status = Path(f"/proc/{pid}/stat")
+        while status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z":
+            assert time.monotonic() < deadline, f"worker {pid} has outlived its parent"
+            time.sleep(0.02)
+
+
+@pytest.mark.parametrize("busy", ["sys.stdin.read()", "emulators.send([0, 0]); sys.stdin.read()"])
+def test_workers_and_their_memory_do_not_outlive_a_killed_parent(busy: str) -> None:
+    shared_before = set(os.listdir("/dev/shm"))
+    parent = subprocess.Popen(
+        [sys.executable, "-c", PARENT + busy], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert parent.stdout is not None
+    pids = [int(pid) for pid in parent.stdout.readline().split()]
+    assert len(pids) == 2
+    parent.kill()
+    _, complaints = parent.communicate()
+    await_end(pids)
+    assert complaints == b""
+    assert set(os.listdir("/dev/shm")) <= shared_before
+
+
+def test_a_parent_that_forgets_to_close_ends_in_silence() -> None:
+    told = subprocess.run([sys.executable, "-c", PARENT], capture_output=True, check=True, timeout=60)
+    assert told.stderr == b""
+    await_end([int(pid) for pid in told.stdout.split()])
+
+
+def test_workers_import_nothing_but_this_wing() -> None:
+    code = "import sys, atlantis_exp.game.vector; print(*sys.modules)"
+    modules = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True).stdout.split()
+    ours = {name for name in modules if name.startswith("atlantis_exp.")}
+    assert ours == {"atlantis_exp.game"} | {
+        f"atlantis_exp.game.{room}" for room in ("preprocessing", "emulator", "vector")
+    }
+    assert not {"torch", "mlflow", "hydra", "omegaconf", "matplotlib"} & set(modules)

@@ -1,0 +1,432 @@
+import copy
+import json
+from collections.abc import Callable, Iterator
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from safetensors.torch import load, save
+from torch import nn
+from torch.nn.functional import smooth_l1_loss
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from atlantis_exp.learning.learner import Learner
+from atlantis_exp.learning.objectives import DQN, DoubleDQN, Objective
+from atlantis_exp.networks.cnn import DQNCnn
+from atlantis_exp.networks.dropout import seed_dropout
+from atlantis_exp.networks.resnet import ResNetDQN
+
+Precision = Literal["fp32", "bf16"]
+Batch = tuple[
+    npt.NDArray[np.uint8],
+    npt.NDArray[np.int64],
+    npt.NDArray[np.float32],
+    npt.NDArray[np.uint8],
+    npt.NDArray[np.bool_],
+]
+
+_SIDE = {DQNCnn: 36, ResNetDQN: 31}  # pixels; small, since the tests are about the learner
+every_network = pytest.mark.parametrize("network_class", [DQNCnn, ResNetDQN])
+every_precision = pytest.mark.parametrize("precision", ["fp32", "bf16"])
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    """Threads only wait for one another in networks this small."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def _networks(network_class: type[nn.Module], seed: int = 0) -> tuple[nn.Module, nn.Module]:
+    """A network and a target network of other weights, so that taking one for the other shows."""
+    side = _SIDE[network_class]
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        network, target = network_class((4, side, side), 4), network_class((4, side, side), 4)
+    seed_dropout(network, seed)
+    seed_dropout(target, seed + 1)
+    return network, target
+
+
+def _learner(
+    network_class: type[nn.Module],
+    *,
+    seed: int = 0,
+    objective: Objective = DoubleDQN(0.9),  # noqa: B008 - frozen
+    tau: float = 0.1,
+    precision: Precision = "fp32",
+    target_mode: Literal["eval", "train"] = "eval",
+) -> Learner:
+    network, target = _networks(network_class, seed)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, fused=True)
+    return Learner(network, target, optimizer, objective, tau, precision=precision, target_mode=target_mode)
+
+
+def _batch(side: int, seed: int = 0, size: int = 6) -> Batch:
+    rng = np.random.default_rng(seed)
+    return (
+        rng.integers(0, 256, (size, 4, side, side), dtype=np.uint8),
+        rng.integers(0, 4, size),
+        rng.choice([0, 1, 100], size).astype(np.float32),
+        rng.integers(0, 256, (size, 4, side, side), dtype=np.uint8),
+        rng.random(size) < 0.3,
+    )
+
+
+def _same(left: nn.Module, right: nn.Module) -> bool:
+    pairs = zip(left.state_dict().items(), right.state_dict().items(), strict=True)
+    return all(a == b and torch.equal(x, y) for (a, x), (b, y) in pairs)
+
+
+def _through_disk(state: dict[str, Any]) -> dict[str, Any]:
+    """Write a state dict as a checkpoint does, tensors to safetensors and the rest to JSON, and read it back."""
+    tensors: dict[str, torch.Tensor] = {}
+
+    def split(node: Any, path: str) -> Any:
+        if isinstance(node, dict):
+            assert all(isinstance(key, str) for key in node)
+            return {key: split(value, f"{path}/{key}") for key, value in node.items()}
+        if isinstance(node, torch.Tensor):
+            tensors[path] = node
+            return path
+        assert node is None or isinstance(node, int | float)
+        return node
+
+    def join(node: Any) -> Any:
+        if isinstance(node, dict):
+            return {key: join(value) for key, value in node.items()}
+        return stored[node] if isinstance(node, str) else node
+
+    plain, stored = json.loads(json.dumps(split(state, ""))), load(save(tensors))
+    joined: dict[str, Any] = join(plain)
+    return joined
+
+
+# The update
+
+
+def _reference_update(
+    network: nn.Module, target: nn.Module, optimizer: torch.optim.Optimizer, batch: Batch, precision: Precision
+) -> float:
+    """Double DQN as the textbook has it: plain autocast, nothing cached, the soft update as a formula."""
+    s_t, a_t, r_t, s_tp1, terminated = (torch.from_numpy(array) for array in batch)
+
+    def q(module: nn.Module, states: torch.Tensor) -> torch.Tensor:
+        with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
+            values: torch.Tensor = module(states.float() / 255)
+        return values.float()
+
+    with torch.no_grad():
+        a_tp1 = q(network.eval(), s_tp1).argmax(1)
+        v_tp1 = q(target.eval(), s_tp1)[range(len(a_tp1)), a_tp1]
+    errors = q(network.train(), s_t)[range(len(a_t)), a_t]
+    loss = smooth_l1_loss(errors, torch.where(terminated, r_t, r_t + 0.9 * v_tp1))
+    optimizer.zero_grad()
+    loss.backward()  # type: ignore[no-untyped-call]
+    optimizer.step()
+    old, new = target.state_dict(), network.state_dict()
+    target.load_state_dict(
+        {key: 0.1 * new[key] + 0.9 * old[key] if old[key].is_floating_point() else new[key] for key in old}
+    )
+    return loss.item()
+
+
+@every_network
+@every_precision
+def test_an_update_is_the_textbook_s(network_class: type[nn.Module], precision: Precision) -> None:
+    learner = _learner(network_class, precision=precision)
+    network, target = copy.deepcopy((learner.network, learner.target))
+    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, fused=True)
+    for seed in range(2):
+        batch = _batch(_SIDE[network_class], seed)
+        learner.update(*batch)
+        loss = _reference_update(network, target, optimizer, batch, precision)
+        assert learner.statistics()["loss"] == pytest.approx(loss)
+        # the next update must start from the same bits: the two soft updates round differently
+        torch.testing.assert_close(learner.target.state_dict(), target.state_dict(), rtol=1e-6, atol=1e-7)
+        assert _same(learner.network, network)
+        target.load_state_dict(learner.target.state_dict())
+
+
+class _Witness(nn.Module):
+    """A network that writes down who was asked about which states, in which mode."""
+
+    def __init__(self, name: str, tape: list[str]) -> None:
+        super().__init__()
+        self.name, self.tape = name, tape
+        self.values = nn.Parameter(torch.zeros(4))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        self.tape.append(f"{self.name} {'trains' if self.training else 'evaluates'} {x.amax().item():.1f}")
+        return self.values.expand(len(x), 4)
+
+
+@pytest.mark.parametrize(
+    ("objective", "target_mode", "events"),
+    [
+        (DQN(0.9), "eval", ["target evaluates 1.0", "network trains 0.2"]),
+        (DQN(0.9), "train", ["target trains 1.0", "network trains 0.2"]),
+        (DoubleDQN(0.9), "eval", ["network evaluates 1.0", "target evaluates 1.0", "network trains 0.2"]),
+    ],
+)
+def test_the_online_network_trains_on_s_t_alone(
+    objective: Objective, target_mode: Literal["eval", "train"], events: list[str]
+) -> None:
+    tape: list[str] = []
+    network, target = _Witness("network", tape), _Witness("target", tape)
+    optimizer = torch.optim.SGD(network.parameters(), lr=0.1)
+    learner = Learner(network, target, optimizer, objective, 0.1, target_mode=target_mode)
+    s_t, s_tp1 = np.full((2, 4, 1, 1), 51, np.uint8), np.full((2, 4, 1, 1), 255, np.uint8)
+    learner.update(s_t, np.array([0, 1]), np.ones(2, np.float32), s_tp1, np.zeros(2, np.bool_))
+    learner.q_values(s_t)
+    assert tape == [*events, "network evaluates 0.2"]
+
+
+def test_one_batch_can_be_learned_by_heart() -> None:
+    learner = _learner(DQNCnn)
+    s_t, a_t, r_t, s_tp1, _ = _batch(36)
+    r_t = r_t.clip(0, 1)
+    for _ in range(60):
+        learner.update(s_t, a_t, r_t, s_tp1, np.ones(6, np.bool_))
+    np.testing.assert_allclose(learner.q_values(s_t)[range(6), a_t], r_t, atol=0.05)
+
+
+def test_targets_send_no_gradient() -> None:
+    learner = _learner(DQNCnn)
+    learner.update(*_batch(36))
+    assert all(parameter.grad is None for parameter in learner.target.parameters())
+
+
+# The soft update
+
+
+@pytest.mark.parametrize("tau", [1e-4, 0.3, 1.0])
+def test_the_target_network_follows_by_tau(tau: float) -> None:
+    learner = _learner(ResNetDQN, tau=tau)
+    before = copy.deepcopy(learner.target.state_dict())
+    learner.update(*_batch(31))
+    after, network = learner.target.state_dict(), learner.network.state_dict()
+    for key, old in before.items():
+        if old.is_floating_point():
+            expected = tau * network[key].double() + (1 - tau) * old.double()
+            torch.testing.assert_close(after[key].double(), expected, rtol=1e-6, atol=1e-7)
+        else:
+            assert torch.equal(after[key], network[key])
+
+
+def test_a_target_in_train_mode_keeps_running_statistics_of_its_own() -> None:
+    learner = _learner(ResNetDQN, target_mode="train", objective=DQN(0.9), tau=1.0)
+    s_t, a_t, r_t, s_tp1, terminated = _batch(31)
+    stream = learner.target.get_submodule("regression.0").generator
+    assert isinstance(stream, torch.Generator)
+    before = stream.get_state()
+    learner.update(s_t, a_t, r_t, s_tp1, terminated)
+    assert not torch.equal(stream.get_state(), before)
+    for ours, theirs in zip(learner.target.parameters(), learner.network.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+    # the first normalisation saw s_tp1 through the target's own first weights, not s_t through the network's
+    mean, other = (
+        learner.target.get_buffer("block1.2.running_mean"),
+        learner.network.get_buffer("block1.2.running_mean"),
+    )
+    assert not torch.equal(mean, other)
+    assert int(learner.target.get_buffer("block1.2.num_batches_tracked")) == 1
+
+
+# Acting
+
+
+@every_network
+@every_precision
+def test_acting_changes_nothing(network_class: type[nn.Module], precision: Precision) -> None:
+    learner = _learner(network_class, precision=precision)
+    states, *_ = batch = _batch(_SIDE[network_class])
+    learner.update(*batch)
+    before = copy.deepcopy(learner.state_dict())
+    modes = [module.training for module in learner.network.modules()]
+    first = learner.q_values(states)
+    assert first.dtype == np.float32
+    assert first.shape == (6, 4)
+    np.testing.assert_array_equal(learner.q_values(states), first)
+    assert [module.training for module in learner.network.modules()] == modes
+    torch.testing.assert_close(learner.state_dict(), before, rtol=0, atol=0)
+
+
+@every_network
+def test_values_are_the_eval_mode_network_s_of_scaled_states(network_class: type[nn.Module]) -> None:
+    learner = _learner(network_class)
+    states, *_ = batch = _batch(_SIDE[network_class])
+    learner.update(*batch)
+    with torch.no_grad():
+        expected = copy.deepcopy(learner.network).eval()(torch.from_numpy(states) / 255)
+    np.testing.assert_array_equal(learner.q_values(states), expected.numpy())
+
+
+@every_network
+def test_acting_in_bfloat16_uses_the_latest_weights(network_class: type[nn.Module]) -> None:
+    learner = _learner(network_class, precision="bf16")
+    states, *_ = batch = _batch(_SIDE[network_class])
+    learner.update(*batch)
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        expected = copy.deepcopy(learner.network).eval()(torch.from_numpy(states) / 255).float()
+    np.testing.assert_array_equal(learner.q_values(states), expected.numpy())
+
+
+# Randomness
+
+
+def test_no_global_generator_is_moved() -> None:
+    learner = _learner(ResNetDQN)
+    before = torch.get_rng_state()
+    learner.update(*_batch(31))
+    learner.q_values(_batch(31)[0])
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_the_dropout_seed_is_all_that_tells_two_equal_learners_apart() -> None:
+    learner, twin, other = _learner(ResNetDQN), _learner(ResNetDQN), _learner(ResNetDQN)
+    seed_dropout(other.network, 99)
+    for each in (learner, twin, other):
+        each.update(*_batch(31))
+    assert _same(learner.network, twin.network)
+    assert not _same(learner.network, other.network)
+
+
+# Statistics
+
+
+def test_statistics_are_means_since_the_last_call() -> None:
+    learner = _learner(DQNCnn)
+    batches = [_batch(36, seed) for seed in range(3)]
+    assert learner.statistics() == {}
+    learner.update(*batches[0])
+    learner.statistics()
+    single = copy.deepcopy(learner)
+    seen = []
+    for batch in batches[1:]:
+        single.update(*batch)
+        seen.append(single.statistics())
+        learner.update(*batch)
+    assert learner.statistics() == {key: pytest.approx((seen[0][key] + seen[1][key]) / 2) for key in seen[0]}
+    assert learner.statistics() == {}
+    assert learner.updates == 3
+
+
+def test_each_statistic_is_what_its_name_says() -> None:
+    network, target = _Witness("network", []), _Witness("target", [])
+    network.load_state_dict({"values": torch.tensor([1.0, 2, 3, 4])})
+    target.load_state_dict({"values": torch.tensor([5.0, 6, 7, 8])})
+    learner = Learner(network, target, torch.optim.SGD(network.parameters(), lr=0.1), DQN(0.5), 0.1)
+    states = np.zeros((2, 4, 1, 1), np.uint8)
+    learner.update(states, np.array([0, 1]), np.array([0, 10], np.float32), states, np.array([False, True]))
+    assert learner.statistics() == {
+        "loss": (2.5 + 7.5) / 2,  # |1 - 4| and |2 - 10|, less a half each
+        "q": 2.5,
+        "target": (0.5 * 8 + 10) / 2,
+        "gradient_norm": pytest.approx(0.5**0.5),  # half a step for each of two values
+    }
+
+
+class _Tape(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Writes down every operation that reaches the device."""
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.events: list[str] = []
+
+    def __torch_dispatch__(self, func: Callable[..., Any], types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.events.append(str(func))
+        return func(*args, **(kwargs or {}))
+
+
+def test_an_update_never_waits_for_the_device() -> None:
+    learner = _learner(ResNetDQN)
+    with _Tape() as tape:
+        learner.update(*_batch(31))
+        assert "aten.convolution_backward.default" in tape.events
+        assert "aten._local_scalar_dense.default" not in tape.events
+        learner.statistics()
+        learner.first_nonfinite_update()
+        assert "aten._local_scalar_dense.default" in tape.events
+
+
+@pytest.mark.parametrize("poison", [np.inf, np.nan])
+def test_the_first_loss_that_is_no_number_is_remembered(poison: float) -> None:
+    learner = _learner(DQNCnn)
+    s_t, a_t, r_t, s_tp1, terminated = _batch(36)
+    learner.update(s_t, a_t, r_t, s_tp1, terminated)
+    assert learner.first_nonfinite_update() is None
+    for _ in range(2):
+        learner.update(s_t, a_t, np.full_like(r_t, poison), s_tp1, terminated)
+    assert learner.first_nonfinite_update() == 1
+    restored = _learner(DQNCnn)
+    restored.load_state_dict(_through_disk(learner.state_dict()))
+    assert restored.first_nonfinite_update() == 1
+    assert not np.isfinite(learner.statistics()["loss"])
+
+
+# Continuing
+
+
+@every_network
+@every_precision
+@pytest.mark.parametrize("target_mode", ["eval", "train"])
+def test_a_restored_learner_continues_bit_for_bit(
+    network_class: type[nn.Module], precision: Precision, target_mode: Literal["eval", "train"]
+) -> None:
+    def learner(seed: int) -> Learner:
+        return _learner(network_class, seed=seed, precision=precision, target_mode=target_mode)
+
+    batches = [_batch(_SIDE[network_class], seed) for seed in range(4)]
+    unbroken, restored = learner(0), learner(10)
+    unbroken.learning_rate = 3e-4
+    for batch in batches[:2]:
+        unbroken.update(*batch)
+    saved = _through_disk(unbroken.state_dict())
+    restored.load_state_dict(saved)
+    for batch in batches[2:]:
+        np.testing.assert_array_equal(unbroken.q_values(batch[0]), restored.q_values(batch[0]))
+        unbroken.update(*batch)
+        restored.update(*batch)
+    torch.testing.assert_close(unbroken.state_dict(), restored.state_dict(), rtol=0, atol=0)
+    assert unbroken.statistics() == restored.statistics()
+    assert restored.updates == 4
+    assert restored.learning_rate == 3e-4
+
+
+def test_a_loaded_state_stays_the_caller_s() -> None:
+    learner, restored = _learner(DQNCnn), _learner(DQNCnn, seed=10)
+    learner.update(*_batch(36))
+    state = learner.state_dict()
+    restored.load_state_dict(state)
+    before = copy.deepcopy(state)
+    restored.update(*_batch(36, 1))
+    torch.testing.assert_close(state, before, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("optimizer_class", [torch.optim.Adam, torch.optim.RMSprop])
+def test_other_optimizers_continue_too(optimizer_class: type[torch.optim.Optimizer]) -> None:
+    def learner(seed: int) -> Learner:
+        network, target = _networks(DQNCnn, seed)
+        optimizer = optimizer_class(network.parameters(), lr=1e-3)  # type: ignore[call-arg]
+        return Learner(network, target, optimizer, DQN(0.9), 0.1)
+
+    unbroken, restored = learner(0), learner(10)
+    unbroken.update(*_batch(36))
+    restored.load_state_dict(_through_disk(unbroken.state_dict()))
+    unbroken.update(*_batch(36, 1))
+    restored.update(*_batch(36, 1))
+    torch.testing.assert_close(unbroken.state_dict(), restored.state_dict(), rtol=0, atol=0)
+
+
+def test_the_learning_rate_reaches_every_parameter_group() -> None:
+    network, target = _networks(DQNCnn)
+    groups = [{"params": [parameter]} for parameter in network.parameters()]
+    learner = Learner(network, target, torch.optim.AdamW(groups, lr=1e-3), DQN(0.9), 0.1)
+    learner.learning_rate = 3e-4
+    assert learner.learning_rate == 3e-4
+    assert {group["lr"] for group in learner.optimizer.param_groups} == {3e-4}

@@ -1,0 +1,395 @@
+"""Transitions by id against whole stacks kept in a list."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import chisquare
+
+from atlantis_exp.replay.memory import ReplayMemory, Transitions
+
+SHAPE = (6, 5)
+Frame = npt.NDArray[np.uint8]
+
+
+class Event(NamedTuple):
+    """One observation of one environment; an environment without an episode begins one whatever `begins` says."""
+
+    env: int
+    begins: bool
+    action: int
+    reward: float
+    terminated: bool
+    noise: bool
+
+
+EVENTS = st.lists(
+    st.builds(
+        Event,
+        env=st.integers(0, 3),
+        begins=st.sampled_from([False] * 9 + [True]),
+        action=st.integers(0, 3),
+        reward=st.sampled_from([0.0, 100.0, 200.0, -1.5]),
+        terminated=st.sampled_from([False] * 9 + [True]),
+        noise=st.booleans(),
+    ),
+    max_size=80,
+)
+CAPACITIES = st.integers(5, 40)
+NOISE_BUDGETS = st.sampled_from([9, 12, 1_000])  # frames of noise
+
+
+def memory_of(capacity: int, noise_frames: int = 1_000, stack: int = 4) -> ReplayMemory:
+    return ReplayMemory(capacity, SHAPE, stack=stack, budget_bytes=23 * capacity + 46 * noise_frames)
+
+
+@dataclass
+class Oracle:
+    """Keeps every transition whole, for ever, with the ids of the observations it is made of."""
+
+    stack: int = 4
+    num_observations: int = 0
+    states: dict[int, list[tuple[int, Frame]]] = field(default_factory=dict)
+    transitions: dict[int, tuple[set[int], list[Frame], int, float, list[Frame], bool]] = field(default_factory=dict)
+
+    def feed(self, memory: ReplayMemory, event: Event) -> None:
+        k = self.num_observations
+        observation = np.full(SHAPE, k % 251, np.uint8)
+        if event.noise:
+            observation = np.random.default_rng(k).integers(0, 256, SHAPE, np.uint8)
+        self.num_observations += 1
+        if event.begins or event.env not in self.states:
+            memory.begin(event.env, observation)
+            self.states[event.env] = [(k, observation)] * self.stack
+            return
+        memory.add(event.env, event.action, event.reward, observation, event.terminated)
+        state = self.states[event.env]
+        next_state = [*state[1:], (k, observation)]
+        self.transitions[state[-1][0]] = (
+            {of for of, _ in state + next_state},
+            [frame for _, frame in state],
+            event.action,
+            event.reward,
+            [frame for _, frame in next_state],
+            event.terminated,
+        )
+        self.states[event.env] = next_state
+        if event.terminated:
+            del self.states[event.env]
+
+    def available(self, oldest_id: int) -> list[int]:
+        return sorted(k for k, (needs, *_) in self.transitions.items() if min(needs) >= oldest_id)
+
+    def gather(self, ids: list[int]) -> Transitions:
+        _, s_t, a_t, r_t, s_tp1, terminated = zip(*(self.transitions[k] for k in ids), strict=True)
+        return Transitions(
+            np.array(s_t, np.uint8),
+            np.array(a_t, np.int64),
+            np.array(r_t, np.float32),
+            np.array(s_tp1, np.uint8),
+            np.array(terminated, np.bool_),
+        )
+
+
+def assert_same_transitions(actual: Transitions, expected: Transitions) -> None:
+    for name, column in actual._asdict().items():
+        np.testing.assert_array_equal(column, getattr(expected, name), err_msg=name)
+        assert column.dtype == getattr(expected, name).dtype
+
+
+def assert_same_state(actual: dict[str, Any], expected: dict[str, Any]) -> None:
+    assert actual.keys() == expected.keys()
+    for name, value in actual.items():
+        np.testing.assert_array_equal(value, expected[name], err_msg=name)
+
+
+def played(memory: ReplayMemory, steps: int, seed: int = 0) -> ReplayMemory:
+    """Random play of four environments, rewards of their own for every step."""
+    rng = np.random.default_rng(seed)
+    oracle = Oracle()
+    for step in range(steps):
+        oracle.feed(
+            memory, Event(int(rng.integers(4)), False, step % 4, float(step), rng.random() < 0.05, step % 3 == 0)
+        )
+    return memory
+
+
+def available_ids(memory: ReplayMemory) -> npt.NDArray[np.int64]:
+    return np.unique(memory.draw(100 * memory.capacity, np.random.default_rng(0)))
+
+
+@given(capacity=CAPACITIES, noise_frames=NOISE_BUDGETS, stack=st.integers(1, 4), events=EVENTS)
+def test_the_memory_is_the_newest_part_of_a_list_of_whole_transitions(
+    capacity: int, noise_frames: int, stack: int, events: list[Event]
+) -> None:
+    memory, oracle = memory_of(capacity, noise_frames, stack), Oracle(stack)
+    for event in events:
+        oracle.feed(memory, event)
+        memory.check_valid()
+        assert memory.next_id == oracle.num_observations
+        assert memory.nbytes <= 23 * capacity + 46 * noise_frames
+        if noise_frames >= capacity + 1:
+            assert memory.oldest_id == max(0, memory.next_id - capacity)
+        ids = oracle.available(memory.oldest_id)
+        assert len(memory) == len(ids)
+        if ids:
+            expected = oracle.gather(ids)
+            assert_same_transitions(memory.gather(np.array(ids)), expected)
+            np.testing.assert_array_equal(memory.rewards(np.array(ids)), expected.r_t)
+            assert set(memory.draw(50, np.random.default_rng(0)).tolist()) <= set(ids)
+
+
+@given(
+    capacity=CAPACITIES,
+    noise_frames=NOISE_BUDGETS,
+    events=EVENTS,
+    later=EVENTS,
+    commits=st.sets(st.integers(0, 80)),
+)
+def test_a_memory_restored_from_segments_is_and_remains_the_unbroken_one(
+    capacity: int, noise_frames: int, events: list[Event], later: list[Event], commits: set[int]
+) -> None:
+    memory, oracle = memory_of(capacity, noise_frames), Oracle()
+    segments, written = [], 0
+    for i, event in enumerate(events):
+        if i in commits:
+            segments.append(memory.segment(written))
+            assert segments[-1]["first_id"] == max(written, memory.oldest_id)
+            written = memory.next_id
+        oracle.feed(memory, event)
+    segments.append(memory.segment(written))
+
+    def still_needed() -> Iterator[dict[str, Any]]:
+        for segment in segments[:-1]:
+            if segment["first_id"] + len(segment["lengths"]) > memory.oldest_id:
+                yield segment
+        yield segments[-1]
+
+    restored = played(memory_of(capacity, noise_frames), 30)  # to be forgotten
+    restored.load_segments(still_needed())
+    twin = Oracle(num_observations=oracle.num_observations, states=dict(oracle.states))
+    for i in range(len(later) + 1):
+        assert (len(restored), restored.nbytes) == (len(memory), memory.nbytes)
+        assert_same_state(restored.state_dict(), memory.state_dict())
+        if len(memory):
+            ids = memory.draw(20, np.random.default_rng(1))
+            np.testing.assert_array_equal(restored.draw(20, np.random.default_rng(1)), ids)
+            assert_same_transitions(restored.gather(ids), memory.gather(ids))
+        for event in later[i : i + 1]:
+            oracle.feed(memory, event)
+            twin.feed(restored, event)
+
+
+def test_draws_are_uniform_over_the_available_transitions_and_follow_the_generator() -> None:
+    memory, oracle = memory_of(60), Oracle()
+    rng = np.random.default_rng(5)
+    for step in range(200):
+        oracle.feed(memory, Event(int(rng.integers(4)), rng.random() < 0.1, 0, 0.0, rng.random() < 0.1, step % 2 == 0))
+    ids = oracle.available(memory.oldest_id)
+    assert 20 < len(ids) < 55  # a good part of the ring must be rejected
+    drawn = memory.draw(20_000, np.random.default_rng(3))
+    values, counts = np.unique(drawn, return_counts=True)
+    assert values.tolist() == ids
+    assert chisquare(counts).pvalue > 0.01
+    np.testing.assert_array_equal(memory.draw(20_000, np.random.default_rng(3)), drawn)
+
+
+def test_the_draws_of_a_batch_are_independent() -> None:
+    memory, oracle = memory_of(10), Oracle()
+    for step in range(5):
+        oracle.feed(memory, Event(0, False, 0, 0.0, False, step % 2 == 0))
+    rng = np.random.default_rng(8)
+    first, second = np.array([memory.draw(2, rng) for _ in range(4_000)]).T
+    assert chisquare(np.bincount(4 * first + second, minlength=16)).pvalue > 0.01
+
+
+def test_an_empty_memory_has_nothing_to_draw() -> None:
+    memory = memory_of(10)
+    memory.begin(0, np.zeros(SHAPE, np.uint8))
+    assert len(memory) == 0
+    with pytest.raises(ValueError, match="no transition"):
+        memory.draw(1, np.random.default_rng(0))
+
+
+def test_a_transition_that_is_not_available_is_refused() -> None:
+    memory = played(memory_of(20), 100)
+    for k in (*range(memory.oldest_id), *range(memory.next_id - 1, memory.next_id + 20)):
+        with pytest.raises(ValueError, match="not available"):
+            memory.gather(np.array([memory.draw(1, np.random.default_rng(0))[0], k]))
+        with pytest.raises(ValueError, match="not available"):
+            memory.rewards(np.array([k]))
+
+
+def test_no_transition_aliases_the_observations_it_came_from_nor_the_batch_it_went_to() -> None:
+    """The report's `stack_frame` shifts in place, so that every stored state of an episode is its last one."""
+    memory = memory_of(20)
+    observation = np.zeros(SHAPE, np.uint8)
+    memory.begin(0, observation)
+    for step in range(1, 6):
+        observation[:] = step
+        memory.add(0, 0, 0.0, observation, False)
+    ids = np.arange(5)
+    for column in memory.gather(ids):
+        column[:] = 77
+    s_t, _, _, s_tp1, _ = memory.gather(ids)
+    assert s_t[:, :, 0, 0].tolist() == [[0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 2], [0, 1, 2, 3], [1, 2, 3, 4]]
+    assert s_tp1[:, :, 0, 0].tolist() == [[0, 0, 0, 1], [0, 0, 1, 2], [0, 1, 2, 3], [1, 2, 3, 4], [2, 3, 4, 5]]
+
+
+def test_the_last_observation_of_an_episode_is_a_next_state_but_never_a_state() -> None:
+    memory = memory_of(20)
+    blank = np.zeros(SHAPE, np.uint8)
+    for terminated in (True, False):
+        memory.begin(0, blank)
+        memory.add(0, 0, 0.0, blank, False)
+        memory.add(0, 0, 0.0, blank, terminated)
+    memory.begin(0, blank)
+    assert available_ids(memory).tolist() == [0, 1, 3, 4]
+    assert memory.gather(np.array([0, 1, 3, 4])).terminated.tolist() == [False, True, False, False]
+
+
+def test_a_step_without_an_episode_is_refused() -> None:
+    memory = memory_of(20)
+    blank = np.zeros(SHAPE, np.uint8)
+    with pytest.raises(ValueError, match="environment 2 has no episode"):
+        memory.add(2, 0, 0.0, blank, False)
+    memory.begin(2, blank)
+    memory.add(2, 0, 0.0, blank, True)
+    with pytest.raises(ValueError, match="environment 2 has no episode"):
+        memory.add(2, 0, 0.0, blank, False)
+
+
+@pytest.mark.parametrize("idle", [65_534, 65_535])
+def test_an_environment_idle_for_too_long_is_refused_before_its_distance_overflows(idle: int) -> None:
+    memory = ReplayMemory(70_000, (2, 2), budget_bytes=4 << 20)
+    blank = np.zeros((2, 2), np.uint8)
+    memory.begin(0, blank)
+    memory.begin(1, blank)
+    for _ in range(idle - 1):
+        memory.add(1, 0, 0.0, blank, False)
+    if idle == 65_534:
+        memory.add(0, 3, 5.0, blank, False)
+        assert memory.gather(np.array([0])).r_t.tolist() == [5.0]
+        memory.check_valid()
+    else:
+        with pytest.raises(ValueError, match="environment 0 was idle for 65,535 observations"):
+            memory.add(0, 3, 5.0, blank, False)
+        assert memory.next_id == idle + 1
+
+
+def test_capacity_and_budget_too_small_for_a_transition_are_refused() -> None:
+    with pytest.raises(ValueError, match="does not fit a replay capacity of 4"):
+        memory_of(4)
+    with pytest.raises(ValueError, match="does not hold"):
+        memory_of(10, noise_frames=8)
+
+
+def test_a_segment_holds_what_is_stored_and_none_from_the_future() -> None:
+    memory = played(memory_of(20), 30)
+    assert len(memory.segment(30)["lengths"]) == 0
+    assert len(memory.segment(5)["lengths"]) == 20
+    with pytest.raises(ValueError, match="none since 31"):
+        memory.segment(31)
+
+
+def _set(name: str, index: int, value: object) -> Callable[[dict[str, Any]], None]:
+    def tamper(state: dict[str, Any]) -> None:
+        state[name] = state[name].copy()
+        state[name][index] = value
+
+    return tamper
+
+
+def _put(name: str, change: Callable[[Any], Any]) -> Callable[[dict[str, Any]], None]:
+    return lambda state: state.update({name: change(state[name])})
+
+
+@pytest.mark.parametrize(
+    ("tamper", "complaint"),
+    [
+        (lambda state: state.pop("back"), "back is not a row"),
+        (lambda state: state.pop("first_id"), "first_id is not an int"),
+        (_put("reward", lambda row: row.astype(np.float64)), "reward is not a row of float32"),
+        (_put("action", lambda row: row.reshape(2, -1)), "action is not a row"),
+        (_put("terminated", lambda row: row[:-1]), "rows differ in length"),
+        (_put("data", lambda row: row[:-1]), "do not fit its data"),
+        (_put("lengths", lambda row: np.array([0, row[0] + row[1], *row[2:]], np.uint32)), "do not fit its data"),
+        (_put("lengths", lambda row: np.array([row.sum() - 11] + [1] * 11, np.uint32)), "do not fit its data"),
+        (_put("dictionary", lambda row: row[:-1]), "does not hold observations"),
+        (_put("dictionary", lambda row: row[:0]), "does not hold observations"),
+        (_put("oldest_id", lambda oldest: oldest + 1), "a segment is missing"),
+        (_put("first_id", lambda first: first + 1), "a segment is missing"),
+        (lambda state: state.update(first_id=-1, oldest_id=-1), "before id 0"),
+        (_set("back", 3, 4), "before id 0"),
+        (_set("back", 3, 2), "one successor"),
+        (_set("terminated", 3, True), "does not continue"),
+        (_set("newest", 0, 12), "has been seen"),
+        (_set("newest", 0, 5), "has no successor"),
+        (_set("terminated", 11, True), "has not terminated"),
+        (lambda state: state.update(envs=np.array([0, 1]), newest=np.array([11, 11])), "two environments"),
+        (lambda state: state.update(envs=np.array([0, 1])), "shorter"),
+    ],
+)
+def test_a_corrupt_segment_is_refused(tamper: Callable[[dict[str, Any]], None], complaint: str) -> None:
+    line = memory_of(20)
+    line.begin(0, np.zeros(SHAPE, np.uint8))
+    for step in range(1, 12):
+        line.add(0, 1, 1.0, np.full(SHAPE, step, np.uint8), False)
+    state = line.state_dict()
+    memory_of(20).load_state_dict(dict(state))
+    tamper(state)
+    with pytest.raises(ValueError, match=complaint):
+        memory_of(20).load_state_dict(state)
+
+
+@pytest.mark.parametrize(
+    ("kept_up", "invariant"),
+    [("_forward", "forward mirrors back"), ("_available", "wholly stored"), ("_num_available", "the length")],
+)
+def test_bookkeeping_that_has_drifted_from_the_entries_is_noticed(kept_up: str, invariant: str) -> None:
+    memory = played(memory_of(20), 50)
+    memory.check_valid()
+    setattr(memory, kept_up, getattr(memory, kept_up) ^ True)
+    with pytest.raises(ValueError, match=invariant):
+        memory.check_valid()
+
+
+def test_missing_and_disordered_segments_are_refused() -> None:
+    memory = memory_of(100)
+    segments = []
+    for _ in range(3):
+        written = memory.next_id
+        played(memory, 20, seed=written)
+        segments.append(memory.segment(written))
+    first, second, third = segments
+    memory_of(100).load_segments(segments)
+    for wrong in ([first, third], [second, third], [second, first, third], [third, second]):
+        with pytest.raises(ValueError, match="a segment is missing"):
+            memory_of(100).load_segments(wrong)
+    restored = memory_of(100)
+    restored.load_segments([first])
+    with pytest.raises(ValueError, match="a segment is missing"):
+        restored.load_segments([second])
+
+
+def test_a_memory_too_small_for_the_segments_refuses_them() -> None:
+    state = played(memory_of(40), 100).state_dict()
+    for smaller in (memory_of(39), memory_of(40, noise_frames=9)):
+        with pytest.raises(ValueError, match="smaller"):
+            smaller.load_state_dict(state)
+
+
+def test_segments_of_two_memories_do_not_mix() -> None:
+    memory = played(memory_of(100), 20)
+    other = memory_of(100)
+    other.begin(9, np.ones(SHAPE, np.uint8))
+    played(other, 19)
+    first = memory.segment(0)
+    played(other, 5)
+    with pytest.raises(ValueError, match="a segment is missing"):
+        memory_of(100).load_segments([first, other.segment(20)])
