@@ -44,7 +44,8 @@ def film(screens: Iterable[npt.NDArray[np.uint8]], frames_per_second: float) -> 
             stream = container.add_stream("libx264", rate=rate, options={"crf": "28", "preset": "veryfast"})
             stream.pix_fmt = "yuv420p"
             for screen in screens:
-                stream.height, stream.width = 2 * screen.shape[0], 2 * screen.shape[1]
+                if not stream.codec_context.is_open:
+                    stream.height, stream.width = 2 * screen.shape[0], 2 * screen.shape[1]
                 doubled = screen.repeat(2, axis=0).repeat(2, axis=1)
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(doubled, format="rgb24")))
             container.mux(stream.encode())

@@ -49,9 +49,10 @@ class Emulators(ABC):
         self._rows = rows
         self._sent: Envs | None = None
 
-    def reset(self, envs: Envs, seeds: Sequence[int] | None = None) -> Pixels:
+    def reset(self, envs: Envs, seeds: Sequence[int | None] | None = None) -> Pixels:
         """Begins an episode in each of `envs` and returns the first observations, (len(envs), size, size)."""
-        self._call("reset", {int(env): () if seeds is None else (seeds[i],) for i, env in enumerate(envs)})
+        seeds = [None] * len(envs) if seeds is None else seeds
+        self._call("reset", {int(env): (seed,) for env, seed in zip(envs, seeds, strict=True)})
         self._results()
         return self._columns(envs).observations
 

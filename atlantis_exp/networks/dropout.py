@@ -17,7 +17,7 @@ class Dropout(nn.Dropout):
     def forward(self, input: torch.Tensor) -> torch.Tensor:
         if not self.training:
             return input
-        kept = torch.empty_like(input).bernoulli_(1 - self.p, generator=self.generator)
+        kept = torch.rand(input.shape, generator=self.generator, device=input.device) >= self.p
         return input * kept / (1 - self.p)
 
 

@@ -138,9 +138,11 @@ def test_calls_out_of_turn_are_refused(emulators: Emulators) -> None:
         emulators.receive()
 
 
-def test_actions_must_match_environments(emulators: Emulators) -> None:
+def test_actions_and_seeds_must_match_environments(emulators: Emulators) -> None:
     with pytest.raises(ValueError, match="zip"):
         emulators.step([0] * (NUM_ENVS + 1))
+    with pytest.raises(ValueError, match="zip"):
+        emulators.reset([0], seeds=[1, 2])
     assert len(emulators.step([0] * NUM_ENVS).rewards) == NUM_ENVS
 
 
