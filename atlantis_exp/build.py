@@ -29,6 +29,7 @@ from atlantis_exp.tracking.journal import Tracker
 from atlantis_exp.training.actor import Actor, ConstantActor, EpsilonGreedy, RandomActor
 from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate, replay
+from atlantis_exp.training.forecast import Forecast, forecast
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Cadence, Phase, Plan, Trainer, film_of
 
@@ -198,6 +199,24 @@ def build_network_actor(config: cfg.Config, folder: Path, weights: str, device: 
     learner = build_learner(dataclasses.replace(config, device=device))
     learner.load_state_dict(state["learner"])
     return EpsilonGreedy(learner.q_values, len(ACTIONS)), step
+
+
+def build_forecast(config: cfg.Config, steps_done: int) -> Forecast:
+    """What the rest of this training will cost here; measured on parts of its own."""
+    with build_emulators(config.env, config.env.num_envs) as emulators:
+        return forecast(
+            build_plan(config),
+            build_learner(config),
+            emulators,
+            capacity=config.replay.capacity,
+            max_bytes=config.replay.max_bytes,
+            size=config.env.size,
+            stack=config.env.stack,
+            outputs=Path(config.paths.outputs),
+            steps_done=steps_done,
+            max_steps=config.budget.steps,
+            evaluations_an_episode=1 / (config.evaluation.every_episodes or float("inf")),
+        )
 
 
 def build_baseline(agent: cfg.BaselineAgentConfig) -> Actor:

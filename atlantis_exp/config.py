@@ -230,6 +230,7 @@ class BudgetConfig:
     """Limits of this command that are no part of the experiment."""
 
     steps: Count | None
+    forecast: Literal["refuse", "warn", "off"]
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)

@@ -15,6 +15,7 @@ from atlantis_exp.faults import Fault
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from atlantis_exp.training.progress import Progress
     from atlantis_exp.training.trainer import Trainer
 
 
@@ -103,6 +104,8 @@ def _train(config: Config, folder: Any) -> None:
                 progress.say(f"starting run {folder.name} in {folder.path}")
             journal.tags({**provenance(), **_facts(trainer), "atlantis.kind": "training"})
             journal.status("RUNNING")
+            if config.budget.forecast != "off":
+                _check_forecast(config, trainer.counters.steps, progress)
             outcome = trainer.run(stop)
         except (WorkerDied, CheckpointError, Diverged, OSError) as error:
             journal.status("FAILED")
@@ -135,6 +138,17 @@ def _train(config: Config, folder: Any) -> None:
         }
     )
     print(f"\n{report}\n\nrun {folder.name}: {trainer.counters.steps:,} steps, {trainer.counters.seconds:,.0f} s")
+
+
+def _check_forecast(config: Config, steps_done: int, progress: "Progress") -> None:
+    from atlantis_exp.build import build_forecast
+
+    forecast = build_forecast(config, steps_done)
+    progress.say(str(forecast))
+    if forecast.shortage is not None:
+        if config.budget.forecast == "refuse":
+            raise Fault(f"{forecast.shortage}; budget.forecast=warn starts all the same")
+        progress.say(f"warning: {forecast.shortage}")
 
 
 def _facts(trainer: "Trainer") -> dict[str, str]:

@@ -1,0 +1,140 @@
+"""The budget planner: what a training will cost on this machine, from a few seconds of measurement on it."""
+
+import shutil
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from atlantis_exp.game.vector import Emulators
+from atlantis_exp.learning.learner import Learner
+from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.training.trainer import Plan
+
+_EPISODE_STEPS = 2_000  # of a random player in `Atlantis-v0`; a good one plays many times longer
+_WARM_MEMORY = 512 * 2**20  # bytes that torch and its thread buffers grow by once they work
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What to expect of a training, and what there is."""
+
+    steps_per_second: float
+    steps: int
+    memory: int  # bytes that the process will grow by
+    memory_available: int  # bytes
+    disk: int  # bytes under the outputs folder
+    disk_available: int  # bytes
+
+    @property
+    def hours(self) -> float:
+        """Of training, evaluations not counted."""
+        return self.steps / self.steps_per_second / 3600
+
+    def __str__(self) -> str:
+        return (
+            f"expect about {self.steps_per_second:,.0f} steps/s, {_hours(self.hours)} for {self.steps:,} steps, "
+            f"{_size(self.memory)} of memory ({_size(self.memory_available)} available), "
+            f"{_size(self.disk)} of disk ({_size(self.disk_available)} free)"
+        )
+
+    @property
+    def shortage(self) -> str | None:
+        """What will not suffice and what to do about it, None where all does."""
+        if self.memory > self.memory_available:
+            return (
+                f"memory will not suffice: {_size(self.memory)} needed, {_size(self.memory_available)} available; "
+                f"lower replay.max_bytes or replay.capacity"
+            )
+        if self.disk > self.disk_available:
+            return (
+                f"disk will not suffice: {_size(self.disk)} needed, {_size(self.disk_available)} free; "
+                f"lower replay.capacity, or set paths.outputs to a larger disk"
+            )
+        return None
+
+
+def forecast(
+    plan: Plan,
+    learner: Learner,
+    emulators: Emulators,
+    *,
+    capacity: int,
+    max_bytes: int,
+    size: int,
+    stack: int,
+    outputs: Path,
+    steps_done: int,
+    max_steps: int | None,
+    evaluations_an_episode: float,
+) -> Forecast:
+    """Measure emulation, acting and learning on parts made for it, which are of no use afterwards.
+
+    capacity in observations, max_bytes of the replay memory, size in pixels; the trainer's own parts stay untouched.
+    """
+    num_envs = emulators.num_envs
+    rng = np.random.default_rng(0)
+    memory = ReplayMemory(4_096, (size, size), stack=stack, budget_bytes=4_096 * size * size)
+    for env, observation in enumerate(emulators.reset(range(num_envs), [0] * num_envs)):
+        memory.begin(env, observation)
+
+    def play() -> None:
+        actions = rng.integers(4, size=num_envs)
+        steps = emulators.step(actions)
+        for env in range(num_envs):
+            memory.add(env, int(actions[env]), float(steps.rewards[env]), steps.observations[env], False)
+
+    play_seconds = _median_seconds(play, at_least=8, seconds=1.0)
+    states = np.zeros((num_envs, stack, size, size), np.uint8)
+    act_seconds = _median_seconds(lambda: learner.q_values(states), at_least=3, seconds=0.5)
+    sampler = plan.phases[0].sampler
+
+    def update() -> None:
+        learner.update(*memory.gather(sampler.sample(memory, plan.batch_size, rng)))
+
+    update_seconds = _median_seconds(update, at_least=3, seconds=1.0)
+
+    epsilon = statistics.fmean(plan.epsilon(progress) for progress in np.linspace(0, 1, 101))
+    acts = 1 - epsilon**num_envs  # share of the iterations in which any environment asks the network
+    seconds_a_step = (play_seconds + acts * act_seconds) / num_envs + update_seconds / plan.learn_every
+    length = plan.length * (1 if plan.unit == "steps" else _EPISODE_STEPS)
+    steps = max(1, (length if max_steps is None else min(length, max_steps)) - steps_done)
+    stored = min(capacity, steps_done + steps)
+    replay_bytes = min(max_bytes, stored * memory.nbytes // memory.next_id)
+    weights = sum(tensor.nbytes for tensor in learner.network.state_dict().values())
+    evaluations = 1 + evaluations_an_episode * steps / _EPISODE_STEPS
+    return Forecast(
+        steps_per_second=1 / seconds_a_step,
+        steps=steps,
+        memory=replay_bytes + _WARM_MEMORY,
+        memory_available=psutil.virtual_memory().available,
+        # Two generations of both networks and two moments; weights of each evaluation, in the folder and in MLflow.
+        disk=int(replay_bytes + 8 * weights + 2 * evaluations * weights),
+        disk_available=shutil.disk_usage(_existing(outputs)).free,
+    )
+
+
+def _median_seconds(call: Callable[[], object], at_least: int, seconds: float) -> float:
+    call()
+    taken: list[float] = []
+    while len(taken) < at_least or sum(taken) < seconds:
+        start = time.perf_counter()
+        call()
+        taken.append(time.perf_counter() - start)
+    return statistics.median(taken)
+
+
+def _existing(path: Path) -> Path:
+    return next(folder for folder in (path, *path.parents) if folder.exists())
+
+
+def _size(count: float) -> str:
+    return f"{count / 2**30:,.1f} GiB" if count >= 2**30 else f"{count / 2**20:,.0f} MiB"
+
+
+def _hours(hours: float) -> str:
+    return f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:,.0f} minutes"
