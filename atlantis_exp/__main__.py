@@ -3,14 +3,7 @@
 import importlib
 import sys
 
-VERBS = {
-    "train": "one run, from a composed config; the same command again continues or reports it",
-    "evaluate": "a stored run's network, played again: run=NAME epsilon=0.05",
-    "baseline": "a player without a network: agent=random, agent=constant",
-    "query": "what the environment is",
-    "report": "the results that the outputs folder holds, as a table",
-    "ui": "the MLflow UI on the local store",
-}
+from atlantis_exp.commands import VERBS
 
 
 def main() -> None:
@@ -20,11 +13,9 @@ def main() -> None:
         del sys.argv[1]
         verb = first
     elif first and "=" not in first and first[0] not in "-~+":
-        import difflib
+        from atlantis_exp.config import nearest
 
-        close = difflib.get_close_matches(first, VERBS, n=1)
-        hint = f"did you mean '{close[0]}'?" if close else "no valid choice is near"
-        print(f"atlantis_exp: {first}: no such verb; {hint} (valid: {', '.join(VERBS)})", file=sys.stderr)
+        print(f"atlantis_exp: {first}: no such verb; {nearest(first, VERBS)}", file=sys.stderr)
         sys.exit(2)
     else:
         verb = "train"

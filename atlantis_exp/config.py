@@ -8,6 +8,7 @@ import dataclasses
 import difflib
 import hashlib
 import json
+import re
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -283,10 +284,12 @@ class Config:
                 f"training.batch_size={self.training.batch_size}: larger than replay.capacity={self.replay.capacity}; "
                 f"at most {self.replay.capacity}"
             )
-        if self.training.learn_start >= self.replay.capacity:
+        # An environment's newest observation has no successor yet, and its oldest have no whole stack any more.
+        most = self.replay.capacity - self.env.num_envs * (self.env.stack + 1)
+        if self.training.learn_start >= most:
             raise ConfigError(
-                f"training.learn_start={self.training.learn_start}: the memory never holds more than "
-                f"replay.capacity={self.replay.capacity}, so nothing would be learned"
+                f"training.learn_start={self.training.learn_start}: nothing would be learned, since the memory of "
+                f"replay.capacity={self.replay.capacity} holds no more transitions; need less than {most}"
             )
         if not self.phase:
             raise ConfigError("phase: at least one phase is needed, as in conf/phase/single.yaml")
@@ -311,8 +314,8 @@ class Config:
         for key in ("resume", "device", "threads", "tracking", "budget", "paths", "samplers", "sampler"):
             del tree[key]
         del tree["env"]["workers"]
-        for name, phase in tree["phase"].items():
-            phase["sampler"] = to_dict(self.sampler_of(name))
+        # A list, since the order of phases counts and their names do not.
+        tree["phase"] = [{**phase, "sampler": to_dict(self.sampler_of(name))} for name, phase in tree["phase"].items()]
         return tree
 
     def identity(self) -> str:
@@ -331,8 +334,6 @@ class EvaluateConfig:
 
     run: str
     weights: Literal["latest", "best"]
-    episodes: Count
-    epsilon: Probability
     device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
     evaluation: EvaluationConfig
     tracking: TrackingConfig
@@ -416,10 +417,7 @@ def parse(schema: type[T], tree: Mapping[str, Any]) -> T:
         # Through JSON: its strict mode takes a list for a tuple, which is all that YAML can write.
         return TypeAdapter(schema).validate_json(json.dumps(tree))
     except ValidationError as error:
-        faults = error.errors(include_url=False)
-        # A misspelt key shows twice, as one missing and one extra: the extra one is the user's.
-        fault = min(faults, key=lambda fault: fault["type"] not in ("unexpected_keyword_argument", "extra_forbidden"))
-        raise ConfigError(_explain(fault, tree)) from None
+        raise ConfigError(_explain(error.errors(include_url=False), tree)) from None
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -444,10 +442,34 @@ def digest(tree: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:10]
 
 
-def _explain(fault: ErrorDetails, tree: Mapping[str, Any]) -> str:
-    if isinstance(cause := fault.get("ctx", {}).get("error"), ConfigError):
+def _explain(faults: list[ErrorDetails], tree: Mapping[str, Any]) -> str:
+    """One line for the first fault of a tree, or for an unknown key if there is one."""
+    if isinstance(cause := faults[0].get("ctx", {}).get("error"), ConfigError):
         return str(cause)
-    path: list[str | int] = []
+    # A misspelt key shows twice, as one missing and one extra: the extra one is the user's.
+    fault = min(faults, key=lambda fault: fault["type"] != "unexpected_keyword_argument")
+    path, siblings, node = _locate(fault, tree)
+    key, kind = ".".join(path), fault["type"]
+    if kind == "unexpected_keyword_argument":
+        return f"{key}: no such key; {nearest(path[-1], set(siblings) - {path[-1]})}"
+    if kind in ("missing_argument", "missing"):
+        return f"{key}: missing, and it has no default"
+    if kind == "union_tag_invalid":
+        tags = str(fault["ctx"]["expected_tags"]).replace("'", "").split(", ")
+        given = str(fault["ctx"]["tag"])
+        return f"{key}.name={given}: no such choice; {nearest(given, tags)}"
+    if kind == "literal_error":
+        choices = str(fault["ctx"]["expected"]).replace("'", "").replace(" or ", ", ").split(", ")
+        return f"{key}={node}: no such choice; {nearest(str(node), choices)}"
+    # A key that may hold one type or another has a fault for each.
+    messages = [other["msg"] for other in faults if _locate(other, tree)[0] == path]
+    alternatives = dict.fromkeys(re.sub(r"^\w+ should ", "", message) for message in messages)
+    return f"{key}={json.dumps(node)}: should {' or '.join(alternatives)}"
+
+
+def _locate(fault: ErrorDetails, tree: Mapping[str, Any]) -> tuple[list[str], Mapping[str, Any], Any]:
+    """A fault's key as the user knows it, the mapping it stands in, and its value."""
+    path: list[str] = []
     node: Any = tree
     siblings: Mapping[str, Any] = tree
     for part in fault["loc"]:
@@ -456,24 +478,10 @@ def _explain(fault: ErrorDetails, tree: Mapping[str, Any]) -> str:
             siblings = node
             if part in node:
                 node = node[str(part)]
-                path.append(part)
-            elif fault["type"] == "missing_argument" and part == fault["loc"][-1]:
-                path.append(part)
-        elif isinstance(node, list) and isinstance(part, int) and part < len(node):
-            node = node[part]
-            path.append(part)
-    key = ".".join(str(part) for part in path)
-    kind = fault["type"]
-    if kind in ("unexpected_keyword_argument", "extra_forbidden"):
-        return f"{key}: no such key; {nearest(str(path[-1]), set(siblings) - {str(path[-1])})}"
-    if kind in ("missing_argument", "missing"):
-        return f"{key}: missing"
-    if kind == "union_tag_invalid":
-        tags = str(fault["ctx"]["expected_tags"]).replace("'", "").split(", ")
-        given = str(fault["ctx"]["tag"])
-        return f"{key}.name={given}: no such choice; {nearest(given, tags)}"
-    if kind == "literal_error":
-        choices = str(fault["ctx"]["expected"]).replace("'", "").replace(" or ", ", ").split(", ")
-        return f"{key}={node}: no such choice; {nearest(str(node), choices)}"
-    message = fault["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-    return f"{key}={json.dumps(node)}: should be {message}"
+                path.append(str(part))
+            elif fault["type"] in ("missing_argument", "missing") and part == fault["loc"][-1]:
+                path.append(str(part))
+        elif isinstance(node, list) and isinstance(part, int):
+            node = node[part] if part < len(node) else None
+            path.append(str(part))
+    return path, siblings, node

@@ -2,3 +2,13 @@
 
 Hydra and OmegaConf live here and nowhere else; what a verb does lives on the floors below.
 """
+
+VERBS = {
+    "train": "one run, from a composed config; the same command again continues or reports it (the default verb)",
+    "evaluate": "a stored run's network, played again: run=NAME epsilon=0.05",
+    "baseline": "a player without a network as a tracked run: agent=random, agent=constant",
+    "query": "what the environment is, and what this config makes of it",
+    "report": "the results that the outputs folder holds, as a table",
+    "ui": "the MLflow UI on the local store",
+}
+"""Each verb and what it does, as `--help` lists them."""

@@ -1,22 +1,26 @@
 """A verb as a Hydra app: overrides checked before anything is written, then Hydra's own main with all its flags."""
 
+import argparse
 import itertools
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import NoReturn, TypeVar
 
 import hydra
 from hydra import compose, initialize_config_dir
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
+from atlantis_exp.commands import VERBS
 from atlantis_exp.config import ConfigError, flatten, nearest, parse
 from atlantis_exp.faults import Fault
 
@@ -25,18 +29,6 @@ T = TypeVar("T")
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent
 CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _CHECKOUT / "conf"
-_FLAGS_WITH_VALUE = (
-    "--cfg",
-    "-c",
-    "--package",
-    "-p",
-    "--config-path",
-    "-cp",
-    "--config-name",
-    "-cn",
-    "--config-dir",
-    "-cd",
-)
 
 
 def _outputs_folder() -> str:
@@ -44,68 +36,112 @@ def _outputs_folder() -> str:
     return str((_CHECKOUT if CONF.parent == _CHECKOUT else Path.cwd()) / "outputs")
 
 
+def _help(config_name: str) -> str:
+    verb = config_name if config_name in VERBS else "train"
+    verbs = "\n".join(f"  {verb:10}{purpose}" for verb, purpose in VERBS.items())
+    return f"python -m atlantis_exp {verb} KEY=VALUE ...\n{VERBS[verb]}\n\n== Verbs ==\n{verbs}\n"
+
+
 OmegaConf.register_new_resolver("outputs_folder", _outputs_folder, replace=True)
+OmegaConf.register_new_resolver("help", _help, replace=True)
 
 
 def run_verb(config_name: str, schema: type[T], job: Callable[[T], None]) -> None:
     """Compose `conf/<config_name>.yaml` with the command line's overrides, check it, and call `job` with the result.
 
     A user's mistake ends the process with exit code 2 and one line on stderr before Hydra or the job starts; a `Fault`
-    ends it with its own exit code and one line.
+    ends it with its own exit code and one line, and so does a folder that cannot be written.
     """
     try:
-        _check(config_name, schema, sys.argv[1:])
-    except (ConfigError, HydraException, OmegaConfBaseException) as error:
-        print(f"atlantis_exp: {str(error).strip().splitlines()[0]}", file=sys.stderr)
-        sys.exit(2)
+        check(config_name, schema, sys.argv[1:])
+    except ConfigError as error:
+        _quit(error)
 
     @hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)
     def main(composed: DictConfig) -> None:
         try:
             job(checked(schema, composed))
-        except (ConfigError, Fault) as error:
+        except (ConfigError, Fault, OSError) as error:
             # In a sweep an exit would take the other jobs along, an exception does not.
             if HydraConfig.get().mode is RunMode.MULTIRUN:
                 raise
-            print(f"atlantis_exp: {error}", file=sys.stderr)
-            sys.exit(error.exit_code if isinstance(error, Fault) else 2)
+            _quit(error)
 
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     try:
         main()
-    except Fault as error:
-        print(f"atlantis_exp: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
+    except (ConfigError, Fault, OSError) as error:
+        _quit(error)
+
+
+def _quit(error: Exception) -> NoReturn:
+    print(f"atlantis_exp: {error}", file=sys.stderr)
+    sys.exit(2 if isinstance(error, ConfigError) else getattr(error, "exit_code", 1))
 
 
 def checked(schema: type[T], composed: DictConfig) -> T:
-    """A composed Hydra config as an instance of its schema class."""
+    """A composed Hydra config as an instance of its schema class. Raises: ConfigError."""
     tree = OmegaConf.to_container(composed, resolve=True)
     assert isinstance(tree, dict)
     paths = tree.get("paths")
-    if isinstance(paths, dict) and isinstance(paths.get("outputs"), str):
+    if isinstance(paths, dict) and isinstance(paths.get("outputs"), str) and paths["outputs"]:
         paths["outputs"] = str(Path(paths["outputs"]).expanduser().absolute())
     return parse(schema, {str(key): value for key, value in tree.items()})
 
 
-def _check(config_name: str, schema: type[T], arguments: list[str]) -> None:
-    """Compose and check every job that the arguments ask for. Raises: ConfigError."""
-    texts, skip = [], False
-    for argument in arguments:
-        if not argument.startswith("-") and not skip:
-            texts.append(argument)
-        skip = argument in _FLAGS_WITH_VALUE
-    for text in texts:
-        if "=" not in text and not text.startswith("~"):
-            raise ConfigError(f"'{text}' is no override; write KEY=VALUE, as in model=resnet")
-    overrides = [override for override in OverridesParser.create().parse_overrides(texts) if not _is_hydras(override)]
-    multirun = bool({"-m", "--multirun"} & set(arguments)) or any(text.startswith("hydra.mode=") for text in texts)
+def check(config_name: str, schema: type[T], arguments: list[str]) -> None:
+    """Compose and check every job that a command line asks for; nothing is written.
+
+    Raises:
+        ConfigError: one line for the first mistake, with the nearest valid choice or the valid range.
+    """
+    texts, multirun = _read_flags(arguments)
+    overrides = [_read_override(text) for text in texts]
     for override in overrides:
         if override.is_sweep_override() and not multirun:
             raise ConfigError(f"{override.input_line}: several values are a sweep; add -m")
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        for job in _jobs(overrides):
-            _check_job(config_name, schema, job)
+    hydras = [str(override.input_line) for override in overrides if _is_hydras(override)]
+    overrides = [override for override in overrides if not _is_hydras(override)]
+    known: dict[tuple[str, ...], set[str]] = {}
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            if hydras:
+                compose(config_name, hydras, return_hydra_config=True)
+            for job in _jobs(overrides):
+                _check_job(config_name, schema, job, known)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(" ".join(re.split("Config search path|full_key:", str(error))[0].split())) from None
+
+
+def _read_flags(arguments: list[str]) -> tuple[list[str], bool]:
+    """The overrides of a command line, and whether it is a sweep. Raises: ConfigError."""
+    parser = get_args_parser()
+    parser.exit_on_error = parser.allow_abbrev = False
+    try:
+        flags, unknown = parser.parse_known_args(arguments)
+    except argparse.ArgumentError as error:
+        raise ConfigError(" ".join(str(error).split())) from None
+    if unknown:
+        if not unknown[0].startswith("-"):
+            raise ConfigError(f"{unknown[0]}: write all overrides together, before or after the flags")
+        known = {option for action in parser._actions for option in action.option_strings}
+        raise ConfigError(f"{unknown[0]}: no such flag; {nearest(unknown[0], known)}")
+    for flag in ("config_path", "config_name", "config_dir", "experimental_rerun"):
+        if getattr(flags, flag) is not None:
+            raise ConfigError(f"--{flag.replace('_', '-')}: the verb decides on its config; write overrides instead")
+    sweep = flags.multirun or "hydra.mode=MULTIRUN" in flags.overrides
+    return flags.overrides, sweep
+
+
+def _read_override(text: str) -> Override:
+    if "=" not in text and not text.startswith("~"):
+        raise ConfigError(f"'{text}' is no override; write KEY=VALUE, as in model=resnet")
+    try:
+        return OverridesParser.create().parse_override(text)
+    except HydraException:
+        raise ConfigError(
+            f"{text}: not readable; write KEY=VALUE, a list as KEY=[1,2], other characters in quotes as KEY='\"a ü\"'"
+        ) from None
 
 
 def _is_hydras(override: Override) -> bool:
@@ -125,30 +161,50 @@ def _jobs(overrides: list[Override]) -> Iterator[list[str]]:
         yield list(combination)
 
 
-def _check_job(config_name: str, schema: type[T], texts: list[str]) -> None:
-    overrides = OverridesParser.create().parse_overrides(texts)
-    groups = {str(path.relative_to(CONF)): path for path in CONF.iterdir() if path.is_dir()}
-    for override in overrides:
-        group = override.key_or_group.split("@")[0]
-        if group in groups and not override.is_delete():
-            options = {path.stem for path in groups[group].glob("*.yaml")}
-            value = override.value()
-            if not isinstance(value, str) or value not in options:
-                raise ConfigError(f"{group}={value}: no such option in conf/{group}; {nearest(str(value), options)}")
-    chosen = [text for override, text in zip(overrides, texts, strict=True) if _names_group(override, groups)]
-    known = OmegaConf.to_container(compose(config_name, chosen))
-    assert isinstance(known, dict)
-    keys = {str(key): value for key, value in flatten({str(key): value for key, value in known.items()}).items()}
+def _check_job(config_name: str, schema: type[T], texts: list[str], known: dict[tuple[str, ...], set[str]]) -> None:
+    """Check one job; `known` keeps the keys that each choice of group options gives, for the sweep's other jobs."""
+    overrides = {text: _read_override(text) for text in texts}
+    groups = _groups(config_name)
+    chosen = tuple(text for text, override in overrides.items() if _key(override) in groups)
+    for text in chosen:
+        override = overrides[text]
+        folder, value = override.key_or_group, override.value()
+        options = {path.stem for path in (CONF / folder).glob("*.yaml")}
+        if override.is_delete():
+            raise ConfigError(f"{text}: needed; choose with {folder}=OPTION (valid: {', '.join(sorted(options))})")
+        if not isinstance(value, str) or value not in options:
+            raise ConfigError(f"{folder}={value}: no such option in conf/{folder}; {nearest(str(value), options)}")
+    if chosen not in known:
+        tree = OmegaConf.to_container(compose(config_name, list(chosen)))
+        assert isinstance(tree, dict)
+        known[chosen] = set(flatten({str(key): value for key, value in tree.items()}))
+    keys = known[chosen]
     branches = {key.rsplit(".", depth)[0] for key in keys for depth in range(1, key.count(".") + 1)}
-    for override in overrides:
-        key = override.key_or_group.split("@")[0]
-        if not _names_group(override, groups) and key not in keys and key not in branches:
-            raise ConfigError(f"{override.input_line}: no such key; {_nearest_key(key, {*keys, *branches, *groups})}")
-    checked(schema, compose(config_name, texts))
+    for text, override in overrides.items():
+        if text in chosen:
+            continue
+        key = _key(override)
+        if key not in keys | branches:
+            raise ConfigError(f"{text}: no such key; {_nearest_key(key, keys | branches | groups)}")
+        if override.is_add() and key in keys:
+            raise ConfigError(f"{text}: the key is there already; write {text.removeprefix('+')}")
+        if override.is_delete() and not key.startswith("phase."):
+            raise ConfigError(f"{text}: needed; change it with {key}=VALUE")
+    try:
+        checked(schema, compose(config_name, texts))
+    except InterpolationKeyError as error:
+        missing = "".join(re.findall("'(.*)'", str(error)))
+        raise ConfigError(f"${{{missing}}}: no such key; {_nearest_key(missing, keys)}") from None
 
 
-def _names_group(override: Override, groups: dict[str, Path]) -> bool:
-    return override.key_or_group.split("@")[0] in groups
+def _groups(config_name: str) -> set[str]:
+    """The groups of a verb's defaults list, with the package that they fill: `model`, `sampler@samplers.uniform`."""
+    defaults = OmegaConf.load(CONF / f"{config_name}.yaml").get("defaults", [])
+    return {str(group) for entry in defaults if isinstance(entry, DictConfig) for group in entry}
+
+
+def _key(override: Override) -> str:
+    return override.key_or_group + (f"@{override.package}" if override.package else "")
 
 
 def _nearest_key(key: str, keys: set[str]) -> str:
@@ -159,8 +215,3 @@ def _nearest_key(key: str, keys: set[str]) -> str:
     parent = key.rpartition(".")[0]
     siblings = {known for known in keys if known.rpartition(".")[0] == parent}
     return nearest(key, siblings if siblings and parent else keys)
-
-
-def conf_names() -> dict[str, Any]:
-    """Group names and their options, for tests that compose every preset."""
-    return {path.name: sorted(file.stem for file in path.glob("*.yaml")) for path in CONF.iterdir() if path.is_dir()}

@@ -1,6 +1,7 @@
 """`python -m atlantis_exp evaluate run=NAME epsilon=0.05`: a stored run's network, played again."""
 
-import dataclasses
+import re
+import sys
 from pathlib import Path
 
 from atlantis_exp.commands.app import run_verb
@@ -16,9 +17,9 @@ def evaluate(config: EvaluateConfig) -> None:
     outputs = Path(config.paths.outputs)
     run = find_run(outputs, config.run)
     trained = parse(Config, run.config or {})
-    settings = dataclasses.replace(config.evaluation, episodes=config.episodes, epsilon=config.epsilon)
     progress = Progress()
     actor, step = build_network_actor(trained, run.path, config.weights, config.device)
+    settings = config.evaluation
     progress.say(f"{run.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
     evaluation, video = run_evaluation(actor, trained.env, settings, progress)
     facts = {"run": run.name, "step": step, "evaluation": to_dict(settings), "env": to_dict(trained.env)}
@@ -27,5 +28,7 @@ def evaluate(config: EvaluateConfig) -> None:
 
 
 def main() -> None:
-    """Compose and evaluate."""
+    """Compose and evaluate; `epsilon=` and `episodes=` are short for the evaluation's."""
+    # Hydra itself would take `epsilon` for the config group of that name.
+    sys.argv[1:] = [re.sub(r"^(epsilon|episodes)=", r"evaluation.\1=", argument) for argument in sys.argv[1:]]
     run_verb("evaluate", EvaluateConfig, evaluate)

@@ -1,0 +1,193 @@
+"""The schema: what makes two experiments the same, and what a stored config may not hold."""
+
+import copy
+import random
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from atlantis_exp.commands.app import CONF
+from atlantis_exp.config import Config, ConfigError, digest, flatten, nearest, parse, to_dict
+
+Tree = dict[str, Any]
+
+
+def composed_tree(*overrides: str) -> Tree:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        tree = OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+    assert isinstance(tree, dict)
+    return {str(key): value for key, value in tree.items()}
+
+
+TREES = {
+    name: composed_tree(*overrides)
+    for name, overrides in {
+        "cnn": (),
+        "resnet": ("experiment=paper_resnet", "optimizer=rmsprop", "epsilon=linear", "env=atlantis_standard"),
+        "constant": ("epsilon=constant", "optimizer=adam", "objective=double_dqn", "sampler=top_half"),
+    }.items()
+}
+
+
+def changed(tree: Tree, key: str, value: Any) -> Tree:
+    tree = copy.deepcopy(tree)
+    *parents, last = key.split(".")
+    node = tree
+    for parent in parents:
+        node = node[parent]
+    node[last] = value
+    return tree
+
+
+def is_scientific(key: str) -> bool:
+    """Whether a key decides the run's numbers."""
+    group = key.split(".")[0]
+    free = {"resume", "device", "threads", "tracking", "budget", "paths"}
+    return group not in free and key != "env.workers"
+
+
+def another(key: str, value: Any) -> Any:
+    """A valid value that is not the given one."""
+    special = {
+        "env.id": ("Atlantis-v0", "ALE/Atlantis-v5"),
+        "objective.name": ("dqn", "double_dqn"),
+        "objective.target.mode": ("eval", "train"),
+        "objective.target.start": ("copy", "independent"),
+        "optimizer.name": ("adam", "adamw"),
+        "training.precision": ("fp32", "bf16"),
+        "env.max_pool": (False,) if value else (True,),
+        "env.crop": ([0, 160, 210, 0], [16, 160, 96, 0]),
+        "env.frameskip": (4, 3),
+        "optimizer.betas": ([0.9, 0.999], [0.8, 0.9]),
+        "model.name": ("cnn", "resnet"),
+        "resume": ("auto", "never"),
+        "device": ("auto", "cpu"),
+        "tracking.name": ("mlflow", "none"),
+        "budget.forecast": ("warn", "off"),
+    }
+    if key in special:
+        return next(choice for choice in special[key] if choice != value)
+    if key.endswith(".sampler"):
+        return "uniform" if value == "top_half" else "top_half"
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, int):
+        return value + 1 if value < 30 else value - 1
+    if isinstance(value, float):
+        return value / 2 if value else 0.5
+    if value is None:
+        return 5
+    return f"{value}x"
+
+
+LEAVES = [
+    (name, key)
+    for name, tree in TREES.items()
+    for key in flatten(tree)
+    # Samplers count by the phases that use them, a phase has one length of two, and some names stand for a whole
+    # schema: each has a test of its own.
+    if key.split(".")[0] not in ("sampler", "samplers")
+    and not (key.startswith("phase.") and key.endswith((".episodes", ".steps")))
+    and key != "epsilon.name"
+    and (name, key) != ("resnet", "optimizer.name")
+]
+
+
+@pytest.mark.parametrize(("name", "key"), LEAVES)
+def test_the_identity_depends_on_every_scientific_key_and_on_no_other(name: str, key: str) -> None:
+    tree = TREES[name]
+    if key == "env.max_pool":  # not with a drawn frameskip
+        tree = changed(tree, "env.frameskip", 4)
+    value = flatten(tree)[key]
+    other = parse(Config, changed(tree, key, another(key, value)))
+    assert (other.identity() != parse(Config, tree).identity()) == is_scientific(key)
+
+
+def test_the_identity_depends_on_a_phases_length_and_unit() -> None:
+    lengths = [(2_000, None), (7, None), (None, 7)]
+    trees = [
+        changed(changed(TREES["cnn"], "phase.single.episodes", episodes), "phase.single.steps", steps)
+        for episodes, steps in lengths
+    ]
+    assert len({parse(Config, tree).identity() for tree in trees}) == 3
+
+
+def test_the_identity_tells_schemas_apart() -> None:
+    overrides = ["epsilon=linear", "epsilon=constant", "optimizer=adam", "optimizer=rmsprop", "objective=double_dqn"]
+    identities = {parse(Config, composed_tree(override)).identity() for override in ["seed=0", *overrides]}
+    assert len(identities) == 6
+
+
+def test_a_sampler_counts_where_a_phase_uses_it_and_by_what_it_is() -> None:
+    def identity(*overrides: str) -> str:
+        return parse(Config, composed_tree(*overrides)).identity()
+
+    assert identity("sampler=top_half") != identity("sampler=uniform")
+    assert identity("sampler=top_half") == identity("phase.single.sampler=top_half")
+    assert identity("samplers.top_half.oversample=4") == identity()
+    assert identity("sampler=top_half", "sampler.oversample=4") != identity("sampler=top_half")
+
+
+def test_the_identity_depends_on_no_order() -> None:
+    overrides = ["model=resnet", "sampler=top_half", "phase=two_phase", "seed=3", "optimizer.lr=0.01", "env.sticky=0"]
+    identities = set()
+    for seed in range(3):
+        random.Random(seed).shuffle(overrides)
+        identities.add(parse(Config, composed_tree(*overrides)).identity())
+    assert len(identities) == 1
+
+
+def test_the_order_of_phases_counts_and_their_names_do_not() -> None:
+    tree = composed_tree("phase=two_phase")
+    first, second = tree["phase"].values()
+    identity = parse(Config, tree).identity()
+    assert parse(Config, changed(tree, "phase", {"second": second, "first": first})).identity() != identity
+    assert parse(Config, changed(tree, "phase", {"warm": first, "cold": second})).identity() == identity
+
+
+def test_a_run_is_named_after_what_it_is() -> None:
+    config = parse(Config, composed_tree("experiment=paper_resnet", "seed=4"))
+    assert config.run_name() == f"resnet-uniform-top_half-s4-{config.identity()}"
+
+
+def test_writing_a_config_down_and_reading_it_again_changes_nothing() -> None:
+    for tree in TREES.values():
+        config = parse(Config, tree)
+        assert parse(Config, to_dict(config)) == config
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (lambda tree: tree.pop("seed"), r"seed: missing"),
+        (lambda tree: tree["env"].pop("size"), r"env\.size: missing"),
+        (lambda tree: tree["optimizer"].pop("lr"), r"optimizer\.lr: missing"),
+        (lambda tree: tree.update(modle=1), r"modle: no such key; did you mean 'model'"),
+        (lambda tree: tree["optimizer"].update(ls=1), r"optimizer\.ls: no such key; did you mean 'lr'"),
+        (lambda tree: tree["model"].update(_target_="os.system"), r"model\._target_: no such key"),
+        (lambda tree: tree["phase"]["single"].update(lr=float("nan")), r"phase\.single\.lr=NaN: should be a finite"),
+        (lambda tree: tree.update(env=3), r"env=3: "),
+        (lambda tree: tree.update(phase={}), r"phase: at least one"),
+        (lambda tree: tree.update(model={"name": "vit"}), r"model\.name=vit: no such choice.*cnn, resnet"),
+        (lambda tree: tree["env"].update(crop=[0, 160, 210]), r"env\.crop\.3: missing"),
+    ],
+)
+def test_a_stored_config_that_is_wrong_is_one_line(change: Callable[[Tree], Any], line: str) -> None:
+    tree = copy.deepcopy(TREES["cnn"])
+    change(tree)
+    with pytest.raises(ConfigError, match=line) as caught:
+        parse(Config, tree)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_nearest_choice_is_named_and_few_choices_are_listed() -> None:
+    assert nearest("resnt", ["cnn", "resnet"]) == "did you mean 'resnet'? (valid: cnn, resnet)"
+    assert nearest("zzz", ["cnn", "resnet"]) == "no valid choice is near (valid: cnn, resnet)"
+    assert nearest("key7", [f"key{number}" for number in range(13)]) == "did you mean 'key7'?"
+
+
+def test_a_digest_depends_on_values_and_not_on_order() -> None:
+    assert digest({"a": 1, "b": {"c": 2}}) == digest({"b": {"c": 2}, "a": 1}) != digest({"a": 1, "b": {"c": 3}})
