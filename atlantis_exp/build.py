@@ -17,6 +17,7 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.game.emulator import ACTIONS, Emulator
 from atlantis_exp.game.preprocessing import FrameStack, Preprocessing
 from atlantis_exp.game.vector import Emulators, make_emulators
+from atlantis_exp.learning.allocation import keep_freed_memory
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.learning.objectives import DQN, DoubleDQN, Objective
 from atlantis_exp.learning.schedules import ConstantEpsilon, ExponentialEpsilon, LinearEpsilon, Schedule
@@ -116,6 +117,7 @@ def build_optimizer(optimizer: cfg.AdamConfig | cfg.RmsPropConfig, network: nn.M
 
 def build_learner(config: cfg.Config) -> Learner:
     """Both networks, the optimizer, the objective."""
+    keep_freed_memory()
     device = choose_device(config.device)
     target = config.objective.target
     network = build_network(config.model, config.env, config.seed, "network").to(device)

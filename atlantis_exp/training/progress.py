@@ -62,7 +62,7 @@ class Progress:
         self._marks.clear()  # the time it took is not the training's
         summary = evaluation.summary
         self.say(
-            f"step {trainer.counters.steps:,}, evaluation at epsilon {evaluation.epsilon}, {summary.episodes} episodes: "
+            f"step {trainer.counters.steps:,}, {summary.episodes} episodes evaluated at epsilon {evaluation.epsilon}: "
             f"mean {summary.mean:,.0f} +- {summary.standard_error:,.0f}, high {summary.high:,.0f}, "
             f"low {summary.low:,.0f}, interquartile mean {summary.interquartile_mean:,.0f}"
         )
