@@ -1,0 +1,129 @@
+"""What the benchmarks share: contestants that work in turns, and tables."""
+
+import json
+import multiprocessing
+import statistics
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from importlib.util import find_spec
+from multiprocessing.connection import Connection
+from typing import Any, Generic, Self, TypeVar
+
+from rich.console import Console
+from rich.table import Table
+
+T = TypeVar("T")
+Measure = Callable[[float], T]  # of seconds to work for
+
+
+class Contestant(Generic[T]):
+    """A program in a process of its own that works only while it is measured.
+
+    `program`, a picklable call, builds it there, warms it up and hands over what measures it.
+    """
+
+    def __init__(self, program: Callable[[], AbstractContextManager[Measure[T]]]) -> None:
+        context = multiprocessing.get_context("spawn")  # a clean process: no memory and no threads of this one
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(program, theirs))
+        self._process.start()
+        theirs.close()
+        self._connection.recv()  # it is warm
+
+    def begin(self, seconds: float) -> None:
+        """Let it work; `finish` has the result."""
+        self._connection.send(seconds)
+
+    def finish(self) -> T:
+        """Wait for what it measured; EOFError if it died, its traceback is on stderr."""
+        measured: T = self._connection.recv()
+        return measured
+
+    def measure(self, seconds: float) -> T:
+        """What it measures over some seconds."""
+        self.begin(seconds)
+        return self.finish()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._connection.close()
+        self._process.join()
+
+
+def _serve(program: Callable[[], AbstractContextManager[Measure[Any]]], connection: "Connection[Any, Any]") -> None:
+    with program() as measure:
+        connection.send("warm")
+        try:
+            while True:
+                connection.send(measure(connection.recv()))
+        except EOFError:
+            pass
+
+
+def take_turns(turns: Mapping[str, Callable[[], T]], rounds: int) -> dict[str, list[T]]:
+    """What each call returns, A B C A B C ..., so that a change of the machine's other load meets all alike."""
+    results: dict[str, list[T]] = {name: [] for name in turns}
+    for _ in range(rounds):
+        for name, turn in turns.items():
+            results[name].append(turn())
+    return results
+
+
+def calls_per_second(call: Callable[[], object], seconds: float) -> float:
+    """How often a call can be made, one after the other."""
+    began, calls, elapsed = time.perf_counter(), 0, 0.0
+    while elapsed < seconds:
+        call()
+        calls += 1
+        elapsed = time.perf_counter() - began
+    return calls / elapsed
+
+
+def ratio(rates: Sequence[float] | None, others: Sequence[float] | None) -> float | None:
+    """The ratio of the medians, None where one side was not measured."""
+    return statistics.median(rates) / statistics.median(others) if rates and others else None
+
+
+def paired_ratio(rates: Sequence[float] | None, others: Sequence[float] | None) -> float | None:
+    """The median of the rounds' ratios, None where one side was not measured."""
+    return statistics.median(a / b for a, b in zip(rates, others, strict=True)) if rates and others else None
+
+
+def medians(rates: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """The median rate of each contestant."""
+    return {name: statistics.median(values) for name, values in rates.items()}
+
+
+def missing(peer: str) -> bool:
+    """Whether a peer's package is not installed; says so."""
+    if find_spec(peer) is not None:
+        return False
+    print(f"{peer} is not installed, so it is left out: pip install 'atlantis-exp[peers]'")
+    return True
+
+
+def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table whose first column names the row."""
+    table = Table(title=title, title_justify="left")
+    for index, column in enumerate(columns):
+        table.add_column(column, justify="right" if index else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    Console(width=120, soft_wrap=True).print(table)
+
+
+def print_rates(title: str, unit: str, rates: Mapping[str, Sequence[float]]) -> None:
+    """Print a table of rates, a row for each contestant."""
+    print_table(
+        title,
+        ("", f"median {unit}", "least", "most"),
+        [(name, *(f"{f(values):,.0f}" for f in (statistics.median, min, max))) for name, values in rates.items()],
+    )
+
+
+def print_results(results: Mapping[str, Any]) -> None:
+    """Print the figures as one line of JSON."""
+    print(json.dumps(results), flush=True)

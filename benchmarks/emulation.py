@@ -1,0 +1,181 @@
+"""Emulation speed against the peers and against bare emulators: `python -m benchmarks.emulation`.
+
+All play Atlantis with random actions at skip 4 and sticky 0.25, `--num-envs` environments in lock-step, and hand over
+84x84 grey observations, the brighter of a step's last two frames; no stack, which is not the emulators' work here. The
+peers have as many threads as there are cores, or twice as many: the better one counts. Bare emulators, one process a
+core, emulate frames and look at none. Each contestant is a process of its own and rests while the others have their
+turns.
+"""
+
+import argparse
+import functools
+import os
+import statistics
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from typing import Any
+
+import numpy as np
+from ale_py import ALEInterface
+from ale_py.roms import get_rom_path
+
+from atlantis_exp.game.emulator import Emulator
+from atlantis_exp.game.vector import make_emulators
+from benchmarks.contest import (
+    Contestant,
+    Measure,
+    calls_per_second,
+    medians,
+    missing,
+    print_rates,
+    print_results,
+    ratio,
+    take_turns,
+)
+
+Program = Callable[[], AbstractContextManager[Measure[float]]]
+
+_CORES = len(os.sched_getaffinity(0))
+
+
+@contextmanager
+def ours(num_envs: int, make: Callable[[], Emulator]) -> Iterator[Measure[float]]:
+    """Our emulators, in processes where there are several."""
+    rng = np.random.default_rng(0)
+    with make_emulators(make, num_envs, _CORES) as emulators:
+        emulators.reset(range(num_envs), list(range(num_envs)))
+
+        def step() -> None:
+            steps = emulators.step(rng.integers(4, size=num_envs))
+            ended = np.flatnonzero(steps.terminated | steps.truncated)
+            if len(ended):
+                emulators.reset(ended)
+
+        step()
+        yield lambda seconds: num_envs * calls_per_second(step, seconds)
+
+
+@contextmanager
+def atari_vector(num_envs: int, threads: int) -> Iterator[Measure[float]]:
+    """ale-py's own vector environment."""
+    from ale_py.vector_env import AtariVectorEnv
+
+    env = AtariVectorEnv(
+        "atlantis",
+        num_envs,
+        num_threads=threads,
+        repeat_action_probability=0.25,
+        stack_num=1,
+        noop_max=0,
+        reward_clipping=False,
+        use_fire_reset=False,
+    )
+    yield _play(env, num_envs, np.int64)
+    env.close()
+
+
+@contextmanager
+def envpool(num_envs: int, threads: int) -> Iterator[Measure[float]]:
+    """EnvPool, synchronous."""
+    from envpool import make
+
+    env = make(
+        "Atlantis-v5",
+        env_type="gymnasium",
+        num_envs=num_envs,
+        num_threads=threads,
+        repeat_action_probability=0.25,
+        stack_num=1,
+        noop_max=1,  # its least
+        use_fire_reset=False,
+    )
+    yield _play(env, num_envs, np.int32)
+    env.close()
+
+
+@contextmanager
+def bare() -> Iterator[Measure[float]]:
+    """One emulator that nobody looks at."""
+    ale = ALEInterface()
+    ale.setFloat("repeat_action_probability", 0.25)
+    ale.loadROM(get_rom_path("atlantis"))  # type: ignore[arg-type]
+    actions = ale.getMinimalActionSet()
+    rng = np.random.default_rng(0)
+
+    def step() -> None:
+        action = actions[rng.integers(4)]
+        for _ in range(4):
+            ale.act(action)
+        if ale.game_over():
+            ale.reset_game()
+
+    yield functools.partial(calls_per_second, step)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table and the JSON line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.emulation", description="emulation speed")
+    parser.add_argument("--num-envs", type=int, default=16)
+    parser.add_argument("--rounds", type=int, default=5, help="turns of each contestant")
+    parser.add_argument("--seconds", type=float, default=5.0, help="length of a turn")
+    args = parser.parse_args(arguments)
+
+    # Here, as no contestant needs torch.
+    from atlantis_exp.build import make_emulator
+    from benchmarks.composition import composed
+
+    standard = make_emulator(composed("env=atlantis_standard").env)
+    cropped_84 = make_emulator(composed("env=atlantis_v5", "model=cnn").env)
+    cropped_159 = make_emulator(composed("env=atlantis_v5", "model=resnet").env)
+    programs: dict[str, Program] = {
+        "ours": functools.partial(ours, args.num_envs, standard),
+        "ours, one environment in this process": functools.partial(ours, 1, standard),
+        "ours, report's crop, 84x84": functools.partial(ours, args.num_envs, cropped_84),
+        "ours, report's crop, 159x159": functools.partial(ours, args.num_envs, cropped_159),
+    }
+    for threads in (_CORES, 2 * _CORES):
+        programs[f"AtariVectorEnv, {threads} threads"] = functools.partial(atari_vector, args.num_envs, threads)
+    if not missing("envpool"):
+        for threads in (_CORES, 2 * _CORES):
+            programs[f"EnvPool, {threads} threads"] = functools.partial(envpool, args.num_envs, threads)
+
+    with ExitStack() as stack:
+        turns: dict[str, Callable[[], float]] = {}
+        for name, program in programs.items():
+            turns[name] = functools.partial(stack.enter_context(Contestant(program)).measure, args.seconds)
+        emulators = [stack.enter_context(Contestant(bare)) for _ in range(_CORES)]
+
+        def all_bare() -> float:
+            for emulator in emulators:
+                emulator.begin(args.seconds)
+            return sum(emulator.finish() for emulator in emulators)
+
+        turns[f"bare emulators, {_CORES} processes"] = all_bare
+        rates = take_turns(turns, args.rounds)
+
+    print_rates(f"steps a second, {args.num_envs} environments, {_CORES} cores", "steps/s", rates)
+
+    def best(name: str) -> list[float] | None:
+        return max((rates[key] for key in rates if key.startswith(name)), key=statistics.median, default=None)
+
+    results: dict[str, Any] = {
+        "vs_atari_vector": ratio(rates["ours"], best("AtariVectorEnv")),
+        "vs_envpool": ratio(rates["ours"], best("EnvPool")),
+        "vs_raw": ratio(rates["ours"], best("bare")),
+        "steps_per_second": medians(rates),
+    }
+    print_results(results)
+
+
+def _play(env: Any, num_envs: int, dtype: type[np.signedinteger[Any]]) -> Measure[float]:
+    rng = np.random.default_rng(0)
+    env.reset()
+
+    def step() -> None:
+        env.step(rng.integers(4, size=num_envs, dtype=dtype))
+
+    return lambda seconds: num_envs * calls_per_second(step, seconds)
+
+
+if __name__ == "__main__":
+    main()

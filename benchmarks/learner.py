@@ -1,0 +1,130 @@
+"""The learner's arithmetic against the machine's own: `python -m benchmarks.learner`.
+
+What an update computes is counted by torch's flop counter: convolutions and matrix products of the online network's
+forward and backward pass and of the target network's forward pass, no gradient with regard to the states. What it takes
+is all of `Learner.update`: uint8 in, loss, optimizer and soft update included. Each turn is compared with a
+multiplication of square matrices in the same number format, right before it in the same process.
+"""
+
+import argparse
+import functools
+import statistics
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from atlantis_exp.build import build_learner, choose_device
+from benchmarks.composition import composed
+from benchmarks.contest import calls_per_second, print_results, print_table, take_turns
+
+_SIDE = 2_048  # of the square matrices; larger ones were no faster
+
+
+class Case(NamedTuple):
+    """A network with its batch, in a number format."""
+
+    model: str
+    batch_size: int  # transitions
+    precision: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.model}_{self.precision}"
+
+
+CASES = tuple(Case(*network, precision) for network in (("cnn", 128), ("resnet", 32)) for precision in ("bf16", "fp32"))
+
+
+def update_of(case: Case) -> Callable[[], None]:
+    """An update of a learner on a batch of noise."""
+    config = composed(f"model={case.model}", f"training.precision={case.precision}")
+    learner = build_learner(config)
+    rng = np.random.default_rng(0)
+    states = rng.integers(0, 256, (case.batch_size, config.env.stack + 1, config.env.size, config.env.size), np.uint8)
+    return functools.partial(
+        learner.update,
+        states[:, :-1],
+        rng.integers(4, size=case.batch_size),
+        np.zeros(case.batch_size, np.float32),
+        states[:, 1:],
+        np.zeros(case.batch_size, np.bool_),
+    )
+
+
+def flops_of(update: Callable[[], None]) -> int:
+    """Floating point operations of the matrix products and convolutions of a call."""
+    with FlopCounterMode(display=False) as counter:
+        update()
+    return int(counter.get_total_flops())
+
+
+def gemm_of(precision: str) -> Callable[[], None]:
+    """A multiplication of two square matrices."""
+    device = choose_device("auto")
+    dtype = torch.bfloat16 if precision == "bf16" else torch.float32
+    a, b = torch.ones(2, _SIDE, _SIDE, device=device, dtype=dtype)
+    product = torch.empty_like(a)
+
+    def multiply() -> None:
+        torch.mm(a, b, out=product)
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+
+    return multiply
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table and the JSON line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.learner", description="the learner's FLOP rate")
+    parser.add_argument("--cases", nargs="*", choices=[case.name for case in CASES], default=None)
+    parser.add_argument("--rounds", type=int, default=7, help="turns of each case")
+    parser.add_argument("--seconds", type=float, default=2.0, help="length of a turn")
+    args = parser.parse_args(arguments)
+    cases = [case for case in CASES if args.cases is None or case.name in args.cases]
+
+    turns: dict[str, Callable[[], float]] = {}
+    flops: dict[str, int] = {}
+    for case in cases:
+        gemm, update = gemm_of(case.precision), update_of(case)
+        gemm()
+        update()  # a first call allocates
+        flops[f"gemm_{case.name}"], flops[case.name] = 2 * _SIDE**3, flops_of(update)
+        turns[f"gemm_{case.name}"] = functools.partial(calls_per_second, gemm, args.seconds)
+        turns[case.name] = functools.partial(calls_per_second, update, args.seconds)
+    calls = take_turns(turns, args.rounds)
+
+    results: dict[str, Any] = {"threads": torch.get_num_threads()}
+    rows = []
+    for case in cases:
+        rate, gemm_rate = (statistics.median(calls[name]) * flops[name] for name in (case.name, f"gemm_{case.name}"))
+        shares = [
+            update * flops[case.name] / (gemm * flops[f"gemm_{case.name}"])
+            for update, gemm in zip(calls[case.name], calls[f"gemm_{case.name}"], strict=True)
+        ]
+        share = statistics.median(shares)
+        seconds = 1 / statistics.median(calls[case.name])
+        suffix = "" if case.precision == "bf16" else "_fp32"
+        results[f"gemm_share_{case.model}{suffix}"] = share
+        results[f"update_seconds_{case.name}"] = seconds
+        results[f"flops_a_sample_{case.model}"] = flops[case.name] / case.batch_size
+        rows.append(
+            (
+                case.name,
+                f"{case.batch_size}",
+                f"{flops[case.name] / case.batch_size / 1e6:,.0f} M",
+                f"{seconds * 1e3:.1f} ms",
+                f"{rate / 1e9:,.0f} G/s",
+                f"{gemm_rate / 1e9:,.0f} G/s",
+                f"{share:.0%} ({min(shares):.0%}-{max(shares):.0%})",
+            )
+        )
+    columns = ("", "batch", "FLOPs a sample", "update", "FLOPs", "GEMM", "share")
+    print_table(f"one update, {torch.get_num_threads()} threads", columns, rows)
+    print_results(results)
+
+
+if __name__ == "__main__":
+    main()

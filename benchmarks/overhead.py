@@ -1,0 +1,188 @@
+"""What tracking costs a training: `python -m benchmarks.overhead`.
+
+Two trainings of 16 environments take turns, one with the journal and the thread that mirrors it into a fresh MLflow
+store, one without. Both commit every `--commit-seconds`, far more often than by default, so the shares are upper
+bounds. The speeds differ by less than the machine's noise, so the cost is also timed: all calls of the tracker, with
+the files they write, and the processor time of the mirroring thread. The bookkeeping of an evaluation (histogram,
+tables, weights, but not its games) is timed once a turn and spread over the steps between two evaluations of the
+default config.
+"""
+
+import argparse
+import functools
+import statistics
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+
+from atlantis_exp.tracking.journal import Journal, NullJournal, Tracker
+from atlantis_exp.tracking.store import Publisher, Store
+from atlantis_exp.training.evaluation import Episode, Evaluation
+from atlantis_exp.training.trainer import Trainer
+from benchmarks.composition import composed
+from benchmarks.contest import Contestant, Measure, paired_ratio, print_results, print_table, take_turns
+from benchmarks.training import batch_of, learning, steps_per_second, training_config
+
+_NUM_ENVS = 16
+_EPISODE_STEPS = 2_000  # of a random player; a good one plays many times longer
+
+
+class Turn(NamedTuple):
+    """A turn of a training: its speed, and where time went in seconds."""
+
+    steps_per_second: float
+    seconds: float
+    tracker: float  # in calls of the tracker
+    publisher: float  # processor time of the mirroring thread
+    evaluation: float  # bookkeeping of one evaluation
+
+
+class Timed:
+    """A tracker that adds up the time spent in its methods."""
+
+    def __init__(self, tracker: Tracker) -> None:
+        self.tracker = tracker
+        self.seconds = 0.0
+
+    def __getattr__(self, name: str) -> Any:
+        method = getattr(self.tracker, name)
+
+        def timed(*arguments: Any) -> Any:
+            began = time.perf_counter()
+            try:
+                return method(*arguments)
+            finally:
+                self.seconds += time.perf_counter() - began
+
+        return timed
+
+
+@contextmanager
+def training(tracked: bool, commit_seconds: float) -> Iterator[Measure[Turn]]:
+    """A training that tells where its time goes; with the tracker that a run has, or with none."""
+    size, every = batch_of(_NUM_ENVS)
+    config = training_config(
+        f"env.num_envs={_NUM_ENVS}",
+        f"training.batch_size={size}",
+        f"training.learn_every={every}",
+        f"tracking.commit_seconds={commit_seconds}",
+        "evaluation.at_end=true",
+    )
+    publishers = []
+
+    def tracker_of(folder: Path) -> Tracker:
+        if not tracked:
+            return NullJournal()
+        journal = Journal(folder)
+        publishers.append(Publisher(folder, Store(folder / "store", "overhead")))
+        return journal
+
+    with learning(config, tracker_of) as trainer:
+        tracker = Timed(trainer.tracker)
+        trainer.tracker = cast(Tracker, tracker)
+        trainer.evaluate = lambda _: (_evaluation(), None)
+        clocks = [
+            time.pthread_getcpuclockid(thread.ident)
+            for thread in threading.enumerate()
+            if thread.name == "publisher" and thread.ident is not None
+        ]
+
+        def measure(seconds: float) -> Turn:
+            tracker.seconds, began = 0.0, time.perf_counter()
+            published = sum(map(time.clock_gettime, clocks))
+            speed = steps_per_second(trainer, seconds)
+            return Turn(
+                speed,
+                time.perf_counter() - began,
+                tracker.seconds,
+                sum(map(time.clock_gettime, clocks)) - published,
+                evaluation_seconds(trainer),
+            )
+
+        yield measure
+        for publisher in publishers:
+            publisher.drain(60.0)
+
+
+def evaluation_seconds(trainer: Trainer) -> float:
+    """The time that the bookkeeping of an evaluation takes: ending with one and a commit, and ending with a commit."""
+    trainer.max_steps = trainer.counters.steps
+    marks = [time.perf_counter()]
+    for _ in range(2):
+        trainer.run()
+        marks.append(time.perf_counter())
+    trainer.max_steps = None
+    return max(0.0, (marks[1] - marks[0]) - (marks[2] - marks[1]))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table and the JSON line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.overhead", description="what tracking costs")
+    parser.add_argument("--rounds", type=int, default=5, help="turns of each training")
+    parser.add_argument("--seconds", type=float, default=30.0, help="length of a turn")
+    parser.add_argument("--commit-seconds", type=float, default=10.0, help="time between two commits")
+    args = parser.parse_args(arguments)
+
+    with ExitStack() as stack:
+        turns = {}
+        for name in ("tracked", "untracked"):
+            program = functools.partial(training, name == "tracked", args.commit_seconds)
+            contestant = stack.enter_context(Contestant(program))
+            turns[name] = functools.partial(contestant.measure, args.seconds)
+        measured = take_turns(turns, args.rounds)
+
+    tracked = measured["tracked"]
+    speeds = {name: [turn.steps_per_second for turn in turns] for name, turns in measured.items()}
+    relative_speed = paired_ratio(speeds["tracked"], speeds["untracked"])
+    assert relative_speed is not None
+    tracker = statistics.median(turn.tracker / turn.seconds for turn in tracked)
+    publisher = statistics.median(turn.publisher / turn.seconds for turn in tracked)
+    evaluation = statistics.median(turn.evaluation for turn in tracked)
+    interval_steps = (composed().evaluation.every_episodes or 0) * _EPISODE_STEPS
+    bookkeeping = evaluation * statistics.median(speeds["tracked"]) / interval_steps
+    print_table(
+        f"share of a training's time, a commit every {args.commit_seconds:g} s",
+        ("", "share"),
+        [
+            ("calls of the tracker", f"{tracker:.3%}"),
+            ("processor time of the mirroring thread", f"{publisher:.3%}"),
+            (f"evaluations' bookkeeping ({evaluation:.2f} s each)", f"{bookkeeping:.3%}"),
+            ("speed lost against no tracker", f"{1 - relative_speed:.1%}"),
+        ],
+    )
+    print_results(
+        {
+            "tracking_share": tracker + publisher + bookkeeping,
+            "tracker_share": tracker,
+            "publisher_share": publisher,
+            "evaluation_share": bookkeeping,
+            "evaluation_seconds": evaluation,
+            "speed_lost": 1 - relative_speed,
+            "speed_lost_by_round": [1 - a / b for a, b in zip(speeds["tracked"], speeds["untracked"], strict=True)],
+        }
+    )
+
+
+def _evaluation() -> Evaluation:
+    """What 100 episodes would hand over."""
+    rng = np.random.default_rng()
+    episodes = [
+        Episode(
+            index,
+            float(rng.integers(300)) * 100,
+            4 * _EPISODE_STEPS,
+            actions=bytearray(rng.integers(4, size=_EPISODE_STEPS, dtype=np.uint8)),
+            random=bytearray(rng.integers(2, size=_EPISODE_STEPS, dtype=np.uint8)),
+        )
+        for index in range(100)
+    ]
+    return Evaluation(0.05, episodes)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,100 @@
+"""Each benchmark, at its smallest: it ends in one line of JSON with the figures that others read."""
+
+import itertools
+import json
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
+from typing import Any
+
+import pytest
+
+from benchmarks import emulation, learner, overhead, replay, training
+from benchmarks.contest import paired_ratio, ratio, take_turns
+
+Main = Callable[[Sequence[str]], None]
+
+needs_sb3 = pytest.mark.skipif(find_spec("stable_baselines3") is None, reason="stable-baselines3: extra `peers`")
+needs_envpool = pytest.mark.skipif(find_spec("envpool") is None, reason="envpool: extra `peers`")
+
+
+def results_of(main: Main, arguments: str, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    main(arguments.split())
+    results = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert isinstance(results, dict)
+    return results
+
+
+def test_turns_alternate() -> None:
+    clock = itertools.count()
+    assert take_turns(dict.fromkeys("ab", lambda: next(clock)), rounds=3) == {"a": [0, 2, 4], "b": [1, 3, 5]}
+
+
+def test_a_paired_ratio_cancels_what_slows_a_whole_round() -> None:
+    assert paired_ratio([20.0, 2.0, 40.0], [10.0, 1.0, 20.0]) == 2
+    assert ratio([4.0, 1.0, 9.0], [2.0, 3.0, 1.0]) == 2
+
+
+def test_a_ratio_with_one_side_left_out_is_none() -> None:
+    assert ratio([1.0], None) is None
+    assert paired_ratio(None, [1.0]) is None
+
+
+def test_training_leaves_out_what_it_was_not_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    results = results_of(training.main, "--contestants ours_1 --num-envs --fills --rounds 1 --seconds 0.1", capsys)
+    assert {"vs_sb3_16", "vs_sb3_1", "vs_report", "vs_sb3_16_fp32"} <= results.keys()
+    assert results["vs_sb3_1"] is None
+    assert results["steps_per_second"]["ours_1"] > 0
+    assert results["by_num_envs"] == results["by_fill"] == {}
+
+
+@pytest.mark.slow
+@needs_sb3
+def test_training_measures_every_contestant(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = "--num-envs 4 --fills 1500 --play-steps 300 --rounds 1 --seconds 1"
+    results = results_of(training.main, arguments, capsys)
+    assert results["by_num_envs"]["4"] > 0
+    assert results["by_fill"]["1500"] > 0
+    for key in ("vs_sb3_16", "vs_sb3_1", "vs_report", "vs_report_16", "vs_sb3_16_fp32"):
+        assert results[key] > 0, key
+
+
+@needs_envpool
+def test_emulation_measures_every_contestant(capsys: pytest.CaptureFixture[str]) -> None:
+    results = results_of(emulation.main, "--num-envs 2 --rounds 1 --seconds 0.1", capsys)
+    for key in ("vs_atari_vector", "vs_envpool", "vs_raw"):
+        assert results[key] > 0, key
+
+
+def test_replay_measures_memory_and_sampling(capsys: pytest.CaptureFixture[str]) -> None:
+    results = results_of(replay.main, "--cases 84 --steps 200 --transitions 400 --rounds 1 --seconds 0.05", capsys)
+    assert results["transitions_84"] == 400
+    assert results["bytes_per_transition_84"] > 0
+    assert 0 < results["sample_share_cnn"] < 1
+    assert 0 < results["sample_share_resnet"] < 1
+
+
+@needs_sb3
+def test_sb3_stores_the_bytes_of_its_arrays() -> None:
+    state = 4 * 84 * 84
+    optimized, _ = replay.measure_sb3(84, 32, optimized=True)
+    default, _ = replay.measure_sb3(84, 32, optimized=False)
+    assert state < optimized < state + 100
+    assert 2 * state < default < 2 * state + 100
+
+
+def test_learner_relates_its_arithmetic_to_the_machines(capsys: pytest.CaptureFixture[str]) -> None:
+    results = results_of(learner.main, "--cases cnn_fp32 --rounds 1 --seconds 0.1", capsys)
+    assert 0 < results["gemm_share_cnn_fp32"] < 1.5
+
+
+def test_the_flops_of_an_update_are_those_of_its_layers() -> None:
+    # multiply-adds of the forward pass by layer; the first convolution has no gradient with regard to its input
+    first, others = 20 * 20 * 32 * 4 * 64, 9 * 9 * 64 * 32 * 16 + 7 * 7 * 64 * 64 * 9 + 3136 * 512 + 512 * 4
+    update = learner.update_of(learner.Case("cnn", 2, "fp32"))
+    assert learner.flops_of(update) == 2 * 2 * (3 * first + 4 * others)
+
+
+@pytest.mark.slow
+def test_overhead_tells_the_share_of_tracking(capsys: pytest.CaptureFixture[str]) -> None:
+    results = results_of(overhead.main, "--rounds 1 --seconds 1 --commit-seconds 0.5", capsys)
+    assert 0 < results["tracking_share"] < 1
