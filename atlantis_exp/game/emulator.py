@@ -79,6 +79,8 @@ class Emulator:
         """Begins an episode and returns its first observation; without a seed the random streams go on."""
         if seed is not None:
             self._load_game(seed)
+        self._keep_origin()
+        self._begun = True
         self._ale.reset_game()
         if self._noop_max:
             for _ in range(self._generator.integers(1, self._noop_max + 1)):
@@ -90,6 +92,7 @@ class Emulator:
 
     def step(self, action: int) -> Step:
         """Plays an action for one frameskip; an episode that could be both terminated and truncated is terminated."""
+        self._played.append(action)
         frameskip = self._frameskip
         if not isinstance(frameskip, int):
             frameskip = int(self._generator.integers(*frameskip))
@@ -107,20 +110,24 @@ class Emulator:
         return Step(observation, float(reward), terminated, truncated, self._ale.getFrameNumber() - before)
 
     def state_dict(self) -> dict[str, Any]:
+        """Returns how the episode began and its actions: restored into another emulator, ALE's own state is not exact,
+        since its TIA forgets where the graphics registers point and then draws, and collides, differently."""
         return {
-            "ale": np.frombuffer(self._ale.cloneState(include_rng=True).serialize(), np.uint8),
-            "generator": self._generator.bit_generator.state,
-            "steps": self._steps,
-            "screen": self._screen.copy(),  # ALE draws no screen when it restores a state
-            "pool": self._pool,
+            "ale": self._origin,
+            "generator": self._generator_origin,
+            "begun": self._begun,
+            "actions": np.frombuffer(bytes(self._played), np.uint8),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Plays the episode again up to where it was: a second for some 4,000 steps."""
         self._ale.restoreState(ALEState(state["ale"].tobytes()))
         self._generator.bit_generator.state = state["generator"]
-        self._steps = state["steps"]
-        self._screen[:] = state["screen"]
-        self._pool = state["pool"]
+        self._keep_origin()
+        if state["begun"]:
+            self.reset()
+        for action in state["actions"].tolist():
+            self.step(action)
 
     def _load_game(self, seed: int) -> None:
         """Starts both random streams, split as in ale_py.env.AtariEnv.seed_game; ALE takes a seed only with a game."""
@@ -128,6 +135,13 @@ class Emulator:
         self._generator = np.random.default_rng(own_seed)
         self._ale.setInt("random_seed", ale_seed.astype(np.int32))
         self._ale.loadROM(cast(Path, get_rom_path("atlantis")))
+        self._keep_origin()
+
+    def _keep_origin(self) -> None:
+        self._origin = np.frombuffer(self._ale.cloneState(include_rng=True).serialize(), np.uint8)
+        self._generator_origin = self._generator.bit_generator.state
+        self._begun = False
+        self._played = bytearray()  # actions since the origin
 
     def _act_and_pool(self, action: int, frameskip: int) -> int:
         """Returns the reward; a step cut short pools with the step before, as in `AtariPreprocessing`."""

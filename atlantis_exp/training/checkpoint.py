@@ -17,7 +17,7 @@ from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.tracking.journal import write_file
 
 FORMAT = 1
-_KEPT = 2  # generations
+_SEGMENTS = 64  # of a full memory, about
 
 
 class CheckpointError(RuntimeError):
@@ -28,15 +28,16 @@ class Checkpoints:
     """Generations of a training's state under a folder; the two newest are kept.
 
     A generation is a folder with `state.json` (the tree, with a place for each array), `tensors.safetensors` and
-    `arrays.safetensors`. The replay memory lies beside them in segments that are written once and shared: a save adds
-    only what came since the last one. A generation counts from the moment its `manifest.json`, which holds the
-    checksum of every file, is in place. `identity` is the experiment that the state belongs to.
+    `arrays.safetensors`. The replay memory lies beside them in segments that never change and are shared: a save adds
+    only what came since the last one, and a small last segment once more. A generation counts from the moment its
+    `manifest.json`, which holds the checksum of every file and its own, is in place. `identity` is the experiment that
+    the state belongs to.
     """
 
     def __init__(self, folder: Path, identity: str) -> None:
         self.folder = folder
         self.identity = identity
-        self._segments: list[dict[str, Any]] = []  # of the memory, oldest first: name, sha256, next_id
+        self._segments: list[dict[str, Any]] = []  # of the memory, oldest first: name, since, next_id, sha256
         self._generation = 0
 
     def save(self, state: Mapping[str, Any], memory: ReplayMemory) -> None:
@@ -44,9 +45,11 @@ class Checkpoints:
         segments = [entry for entry in self._segments if entry["next_id"] > memory.oldest_id]
         since = segments[-1]["next_id"] if segments else memory.oldest_id
         if memory.next_id > since:
+            if segments and since - segments[-1]["since"] < memory.capacity // _SEGMENTS:
+                since = segments.pop()["since"]  # written again with what is new, or frequent saves would leave crumbs
             name = f"segments/{since:012d}-{memory.next_id:012d}"
             checksums = self._write(name, memory.segment(since))
-            segments.append({"name": name, "next_id": memory.next_id, "sha256": checksums})
+            segments.append({"name": name, "since": since, "next_id": memory.next_id, "sha256": checksums})
         generation = self._generation + 1
         # What a crash left here is not covered by a manifest.
         shutil.rmtree(self.folder / _name(generation), ignore_errors=True)
@@ -56,9 +59,10 @@ class Checkpoints:
             "segments": segments,
             "state": self._write(_name(generation), state),
         }
+        manifest["sha256"] = _checksum(manifest)
         write_file(self.folder / _name(generation) / "manifest.json", json.dumps(manifest).encode())
+        self._clean(generation, {entry["name"] for entry in self._segments + segments})
         self._segments, self._generation = segments, generation
-        self._clean()
 
     def load(
         self, memory: ReplayMemory | None = None, warn: Callable[[str], None] = lambda _: None
@@ -74,6 +78,8 @@ class Checkpoints:
         for generation in sorted(self._generations(), reverse=True):
             try:
                 manifest = json.loads((self.folder / _name(generation) / "manifest.json").read_bytes())
+                if manifest.pop("sha256") != _checksum(manifest):
+                    raise ValueError("its manifest does not have its checksum")
                 self._refuse_foreign(manifest, generation)
                 state = self._read(_name(generation), manifest["state"])
                 segments = manifest["segments"]
@@ -130,18 +136,18 @@ class Checkpoints:
         tree: dict[str, Any] = _assemble(json.loads(contents["state.json"]), tensors, arrays)
         return tree
 
-    def _clean(self) -> None:
-        """Remove generations beyond the kept ones, and segments that no kept one names."""
-        generations = sorted(self._generations())
-        for generation in generations[:-_KEPT]:
-            shutil.rmtree(self.folder / _name(generation), ignore_errors=True)
-        named = set()
-        for generation in generations[-_KEPT:]:
-            manifest = json.loads((self.folder / _name(generation) / "manifest.json").read_bytes())
-            named |= {entry["name"] for entry in manifest["segments"]}
+    def _clean(self, generation: int, segments: set[str]) -> None:
+        """Remove generations but this one and the one before, and all segments but theirs."""
+        for older in self._generations():
+            if older < generation - 1:
+                shutil.rmtree(self.folder / _name(older), ignore_errors=True)
         for path in self.folder.glob("segments/*"):
-            if f"segments/{path.name}" not in named:
+            if f"segments/{path.name}" not in segments:
                 shutil.rmtree(path, ignore_errors=True)
+
+
+def _checksum(manifest: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
 
 
 def _name(generation: int) -> str:

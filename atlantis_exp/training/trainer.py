@@ -141,7 +141,7 @@ class Trainer:
             WorkerDied: when an emulator's process has ended.
             OSError: when a commit cannot be written; the last one stays.
         """
-        if self.counters.steps == 0:
+        if self.memory.next_id == 0:
             self._begin_all()
         self._session_start = time.monotonic() - self.counters.seconds
         self._last_commit = time.monotonic()
@@ -269,16 +269,21 @@ class Trainer:
         self.lengths += 1
 
     def _write_down(self, steps: Steps) -> None:
-        before = self.counters.steps - self.emulators.num_envs
+        cadence, now = self.cadence, self.counters
+        steps_before, episodes_before = now.steps - self.emulators.num_envs, now.episodes
         for env in np.flatnonzero(steps.terminated | steps.truncated).tolist():
             self._end_episode(env)
-        if _passed(self.cadence.curve_steps, before, self.counters.steps):
+        if _passed(cadence.curve_steps, steps_before, now.steps):
             self._record_curves()
-        if _passed(self.cadence.evaluate_steps, before, self.counters.steps):
+        if _passed(cadence.evaluate_steps, steps_before, now.steps) or _passed(
+            cadence.evaluate_episodes, episodes_before, now.episodes
+        ):
             self._evaluate()
-        self.counters.seconds = time.monotonic() - self._session_start
+        now.seconds = time.monotonic() - self._session_start
         self.progress.update(self)
-        if time.monotonic() - self._last_commit >= self.cadence.commit_seconds:
+        # Last: what else falls due at this step would be missing from a run that continues here.
+        overdue = time.monotonic() - self._last_commit >= cadence.commit_seconds
+        if overdue or _passed(cadence.commit_episodes, episodes_before, now.episodes):
             self.commit()
 
     def _end_episode(self, env: int) -> None:
@@ -306,10 +311,6 @@ class Trainer:
             window = list(self.recent_scores)[-self.cadence.histogram_episodes :]
             title = f"training, episodes {episodes - len(window) + 1}-{episodes}"
             self.tracker.image("score/histogram", score_histogram(window, title), self.counters.steps)
-        if self.cadence.evaluate_episodes and episodes % self.cadence.evaluate_episodes == 0:
-            self._evaluate()
-        if episodes % self.cadence.commit_episodes == 0:
-            self.commit()
 
     def _record_curves(self) -> None:
         # The last multiple, not the step itself: curves of runs with different num_envs then share their grid.

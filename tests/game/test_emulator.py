@@ -218,6 +218,21 @@ def test_a_restored_emulator_plays_on_as_if_never_stopped(settings: dict[str, An
         np.testing.assert_equal(state[key], leaf)  # playing on has not changed what was saved
 
 
+def test_a_restored_emulator_draws_every_pixel_as_if_never_stopped() -> None:
+    """ALE's own state forgets registers of the TIA: shots, which are seldom in the crop, would be drawn elsewhere."""
+    rng = np.random.default_rng(0)
+    ours = emulator(frameskip=(2, 5))
+    ours.reset(seed=0)
+    for step in range(60):
+        if step == 45:
+            ours.reset()
+        restored = emulator(frameskip=(2, 5))
+        restored.load_state_dict(through_a_file(ours.state_dict()))
+        action = int(rng.integers(4))
+        assert ours.step(action)[1:] == restored.step(action)[1:]
+        np.testing.assert_array_equal(restored.screen_rgb(), ours.screen_rgb())
+
+
 def test_a_pool_restored_before_an_unfinished_step_is_the_one_saved() -> None:
     ours, restored = emulator(max_pool=True, max_frames=402), emulator(max_pool=True, max_frames=402)
     ours.reset(seed=0)

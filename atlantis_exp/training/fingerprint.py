@@ -1,0 +1,61 @@
+"""Fingerprints: what two trainings must have in common to be the same, a hash for each part."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.tracking.journal import Image, Metrics, Model, read
+
+WALL_CLOCK = ("throughput/steps_per_second", "throughput/hours")
+"""Metrics that measure the machine, not the training."""
+
+
+def fingerprint(state: Mapping[str, Any], memory: ReplayMemory, folder: Path) -> dict[str, str]:
+    """Hashes of a training's state, of its replay memory, and of the history that its run folder has committed.
+
+    Left out is what the time of day decides: seconds, timestamps, `WALL_CLOCK`, and the journal's length in bytes.
+    """
+    parts = {name: part for name, part in state.items() if name not in ("learner", "tracker")}
+    parts["counters"] = {name: count for name, count in state["counters"].items() if name != "seconds"}
+    learner = dict(state["learner"])
+    parts["weights"] = {"network": learner.pop("network"), "target": learner.pop("target")}
+    parts["learner"] = learner
+    parts["replay"] = memory.state_dict()
+    parts["history"] = {str(index): event for index, event in enumerate(history(folder))}
+    return {name: _digest(part) for name, part in sorted(parts.items())}
+
+
+def history(folder: Path) -> list[dict[str, Any]]:
+    """The metrics, images and models that a run folder has committed, in their order, without the time of day."""
+    events = []
+    for _, record in read(folder):
+        if isinstance(record, Metrics | Image | Model):
+            fields = {name: value for name, value in vars(record).items() if name not in ("time", "values")}
+            values = getattr(record, "values", {})
+            fields["values"] = {name: value for name, value in values.items() if name not in WALL_CLOCK}
+            events.append(fields)
+    return events
+
+
+def _digest(tree: Any) -> str:
+    hashed = hashlib.sha256()
+
+    def add(node: Any) -> None:
+        if isinstance(node, Mapping):
+            for key, value in node.items():
+                hashed.update(f"{key}:".encode())
+                add(value)
+        elif isinstance(node, torch.Tensor | np.ndarray):
+            array = node.detach().cpu().numpy() if isinstance(node, torch.Tensor) else node
+            hashed.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+        else:
+            hashed.update(json.dumps(node).encode() + b"\n")
+
+    add(tree)
+    return hashed.hexdigest()

@@ -1,0 +1,91 @@
+import csv
+import io
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import pytest
+
+from atlantis_exp.build import build_emulators, build_learner, make_emulator
+from atlantis_exp.config import Config
+from atlantis_exp.training.actor import Actor, EpsilonGreedy, RandomActor
+from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate, replay
+
+Compose = Callable[..., Config]
+
+
+@pytest.fixture
+def played(tiny: Compose) -> Callable[..., Evaluation]:
+    def play(num_envs: int, actor: Actor | None = None, **chosen: float) -> Evaluation:
+        env = tiny("env.workers=1", "env.max_steps=25").env
+        settings = {"episodes": 4, "epsilon": 0.5, "seed": 5, "size": env.size, "stack": env.stack, **chosen}
+        with build_emulators(env, num_envs) as emulators:
+            return evaluate(actor or RandomActor(4), emulators, **settings)  # type: ignore[arg-type]
+
+    return play
+
+
+def test_an_episode_depends_on_the_seed_and_its_index_alone(played: Callable[..., Evaluation]) -> None:
+    alone = played(1)
+    assert played(3) == alone
+    assert played(1, episodes=2).episodes == alone.episodes[:2]
+    assert played(1, episodes=2, seed=6).episodes[0].seed != alone.episodes[0].seed
+    actions = {bytes(episode.actions) for episode in alone.episodes}
+    assert len(actions) == 4
+    assert all(episode.steps == 25 and episode.truncated for episode in alone.episodes)
+
+
+def test_a_network_evaluated_twice_plays_twice_the_same(tiny: Compose, played: Callable[..., Evaluation]) -> None:
+    learner = build_learner(tiny())
+    actor = EpsilonGreedy(learner.q_values, 4)
+    generators = {name: stream.get_state() for name, stream in learner._generators().items()}
+    first, second = played(2, actor), played(2, actor)
+    assert first == second
+    assert 0.3 < first.random_share < 0.7
+    assert played(2, actor, epsilon=0.0).random_share == 0.0
+    for name, stream in learner._generators().items():
+        assert stream.get_state().equal(generators[name])
+
+
+def test_more_environments_than_episodes_play_each_episode_once(played: Callable[..., Evaluation]) -> None:
+    ended: list[Episode] = []
+    play = partial(played, on_episode=ended.append)
+    assert sorted(episode.seed for episode in play(3, episodes=2).episodes) == sorted(episode.seed for episode in ended)
+
+
+def test_an_episode_can_be_seen_again_from_its_seed_and_actions(
+    tiny: Compose, played: Callable[..., Evaluation]
+) -> None:
+    episode = played(1).best
+    emulator = make_emulator(tiny("env.max_steps=25").env)()
+    screens = list(replay(episode, emulator))
+    assert len(screens) == episode.steps + 1
+    assert screens[0].shape == (210, 160, 3)
+    emulator.reset(episode.seed)
+    steps = [emulator.step(action) for action in episode.actions]
+    assert sum(step.reward for step in steps) == episode.score
+    assert sum(step.frames for step in steps) == episode.frames
+    assert np.array_equal(screens[-1], emulator.screen_rgb())
+
+
+def test_the_actions_are_counted_by_who_chose_them() -> None:
+    evaluation = Evaluation(
+        0.1,
+        [
+            Episode(1, 300.0, 12, False, bytearray([0, 1, 1, 3]), bytearray([1, 0, 0, 0])),
+            Episode(2, 900.0, 6, True, bytearray([3, 3]), bytearray([1, 0])),
+        ],
+    )
+    assert evaluation.action_counts.tolist() == [[0, 1], [2, 0], [0, 0], [2, 1]]
+    metrics = evaluation.metrics()
+    assert metrics["actions/random_share"] == pytest.approx(2 / 6)
+    assert metrics["actions/random_share_best"] == 0.5
+    assert metrics["actions/LEFTFIRE"] == 0.5
+    assert (metrics["evaluation/mean"], metrics["evaluation/truncated_share"]) == (600, 0.5)
+    [first, second] = csv.DictReader(io.StringIO(evaluation.table()))
+    assert (first["score"], first["random"], first["FIRE"], second["truncated"]) == ("300.0", "1", "2", "1")
+    assert evaluation.report() == (
+        "eval:\n\navg score: 600.0  high score: 900.0  low score: 300.0\n\n"
+        "interquartile range (450.0 -> 750.0) mean = 600.00\n\n"
+        "high score: 900.0, rand: 50.0% neural net: 50.0%"
+    )

@@ -1,0 +1,292 @@
+import dataclasses
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from atlantis_exp.config import Config
+from atlantis_exp.game.vector import WorkerDied
+from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.replay.samplers import Sampler
+from atlantis_exp.tracking.journal import Metrics, read
+from atlantis_exp.training.actor import ConstantActor
+from atlantis_exp.training.fingerprint import fingerprint
+from atlantis_exp.training.trainer import Diverged, Phase, Plan, Trainer
+
+Compose = Callable[..., Config]
+Start = Callable[[Config, Path], Trainer]
+
+TWO_PHASES = (
+    "phase.quick.steps=80",
+    "phase.quick.sampler=uniform",
+    "+phase.second={steps:60,episodes:null,lr:0.0003,sampler:top_half}",
+)
+
+
+def print_of(trainer: Trainer, folder: Path) -> dict[str, str]:
+    return fingerprint(trainer.state_dict(), trainer.memory, folder)
+
+
+def after(stops: int) -> Callable[[], bool]:
+    """A stop request that comes once `stop` was asked that often."""
+    asked = itertools.count()
+    return lambda: next(asked) >= stops
+
+
+def curve(folder: Path, key: str) -> list[tuple[int, float]]:
+    records = [record for _, record in read(folder) if isinstance(record, Metrics)]
+    return [(record.step, record.values[key]) for record in records if key in record.values]
+
+
+@pytest.mark.parametrize("overrides", [("env.num_envs=1",), ("env.num_envs=3", "env.workers=2")])
+def test_a_training_with_evaluations_is_the_same_as_one_without(
+    tiny: Compose, started: Start, tmp_path: Path, overrides: tuple[str, ...]
+) -> None:
+    never = ("evaluation.every_steps=null", "evaluation.at_end=false")
+    often = ("evaluation.every_steps=40", "evaluation.every_episodes=1")
+    prints = []
+    for name, chosen in (("never", never), ("often", often)):
+        trainer = started(tiny(*overrides, *chosen), tmp_path / name)
+        assert trainer.run() == "finished"
+        prints.append(print_of(trainer, tmp_path / name))
+    without, with_evaluations = prints
+    differing = {part for part in without if without[part] != with_evaluations[part]}
+    assert differing == {"best_mean", "evaluated_at", "best_step", "last_report", "last_metrics", "history"}
+    for key in ("score/episode", "learning/loss", "actions/epsilon"):
+        assert curve(tmp_path / "never", key) == curve(tmp_path / "often", key) != []
+
+
+def test_the_same_seed_gives_the_same_training_and_another_seed_another(
+    tiny: Compose, started: Start, tmp_path: Path
+) -> None:
+    prints = []
+    for name, seed in (("first", 3), ("again", 3), ("other", 4)):
+        trainer = started(tiny(f"seed={seed}"), tmp_path / name)
+        trainer.run()
+        prints.append(print_of(trainer, tmp_path / name))
+    first, again, other = prints
+    assert first == again
+    for part in ("weights", "replay", "emulators", "exploration", "sampling", "history"):
+        assert first[part] != other[part]
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("model=cnn", "env.num_envs=1"),
+        ("model=cnn", "env.num_envs=3", "env.workers=2", "objective=double_dqn"),
+        ("model=resnet", "env.size=16", "env.num_envs=1", "optimizer=rmsprop", "objective.target.mode=train"),
+        pytest.param(("model=resnet", "env.size=16", "env.num_envs=8", "env.workers=2"), marks=pytest.mark.slow),
+        pytest.param(("model=cnn", "env.num_envs=8", "env=atlantis_standard", "env.size=40"), marks=pytest.mark.slow),
+    ],
+)
+def test_a_training_killed_in_every_phase_is_the_unbroken_one_bit_for_bit(
+    tiny: Compose, started: Start, tmp_path: Path, overrides: tuple[str, ...]
+) -> None:
+    config = tiny(*TWO_PHASES, *overrides)
+    unbroken = started(config, tmp_path / "unbroken")
+    unbroken.run()
+    for iterations in (0, 7, 17):  # of each session, committed at its end; then some more that are lost
+        session = started(config, tmp_path / "broken")
+        assert session.run(after(iterations)) == "interrupted"
+        session.commit = lambda: None  # type: ignore[method-assign]
+        session.run(after(3))
+    session = started(config, tmp_path / "broken")
+    session.run()
+    assert print_of(session, tmp_path / "broken") == print_of(unbroken, tmp_path / "unbroken")
+
+
+def test_the_time_of_a_commit_changes_nothing(tiny: Compose, started: Start, tmp_path: Path) -> None:
+    prints = []
+    for name, seconds in (("every-step", "1e-9"), ("at-the-end", "1e9")):
+        overrides = ("env.num_envs=2", "env.workers=1", "phase.quick.steps=90", f"tracking.commit_seconds={seconds}")
+        trainer = started(tiny(*overrides), tmp_path / name)
+        trainer.run()
+        prints.append(print_of(trainer, tmp_path / name))
+    assert prints[0] == prints[1]
+
+
+def test_a_commit_finds_everything_that_fell_due_at_its_step_done(
+    tiny: Compose, started: Start, tmp_path: Path
+) -> None:
+    """All three environments end their episodes at one step, at which a curve, an evaluation and a commit fall due."""
+    config = tiny(
+        "env.num_envs=3",
+        "env.workers=1",
+        "tracking.commit_episodes=1",
+        "tracking.every_steps=120",
+        "evaluation.every_steps=120",
+        "phase.quick.steps=240",
+    )
+    unbroken = started(config, tmp_path / "unbroken")
+    unbroken.run()
+    killed = started(config, tmp_path / "broken")
+    commits = []
+    save = killed.checkpoints.save
+
+    def die_after(state: dict[str, Any], memory: ReplayMemory) -> None:
+        save(state, memory)
+        commits.append(killed.counters.steps)
+        raise KeyboardInterrupt
+
+    killed.checkpoints.save = die_after  # type: ignore[method-assign, assignment]
+    with pytest.raises(KeyboardInterrupt):
+        killed.run()
+    assert commits == [120]
+    continued = started(config, tmp_path / "broken")
+    continued.run()
+    assert print_of(continued, tmp_path / "broken") == print_of(unbroken, tmp_path / "unbroken")
+
+
+def test_learning_rate_and_sampler_change_with_the_phase_and_nothing_else_does(
+    tiny: Compose, started: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tape: list[tuple[Any, ...]] = []
+
+    @dataclasses.dataclass(frozen=True)
+    class Taped:
+        name: str
+        sampler: Sampler
+
+        def sample(self, memory: ReplayMemory, count: int, rng: np.random.Generator) -> npt.NDArray[np.int64]:
+            tape.append((trainer.counters.steps, self.name, count, trainer.learner.learning_rate))
+            return self.sampler.sample(memory, count, rng)
+
+    trainer = started(tiny(*TWO_PHASES), tmp_path)
+    phases = [dataclasses.replace(phase, sampler=Taped(phase.name, phase.sampler)) for phase in trainer.plan.phases]
+    monkeypatch.setattr(trainer, "plan", dataclasses.replace(trainer.plan, phases=phases))
+    trainer.run()
+    # The step that crosses the boundary is the first phase's, and so is the update that it makes due.
+    first = [(step, "quick", 4, 0.001) for step in range(24, 80, 4)]
+    second = [(step, "second", 4, 0.0003) for step in range(84, 141, 4)]
+    assert [entry for entry in tape if entry[0] != 80] == first + second
+    assert curve(tmp_path, "learning/phase") == [(step, float(step >= 80)) for step in range(20, 141, 20)]
+    assert trainer.learner.updates == len(tape) == 30
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize(("learn_every", "learn_start"), [(1, 0), (4, 20), (7, 33), (50, 49)])
+def test_updates_are_those_that_a_naive_loop_counts(
+    tiny: Compose, started: Start, tmp_path: Path, num_envs: int, learn_every: int, learn_start: int
+) -> None:
+    config = tiny(
+        f"env.num_envs={num_envs}",
+        "env.workers=1",
+        f"training.learn_every={learn_every}",
+        f"training.learn_start={learn_start}",
+        "training.batch_size=1",
+        "phase.quick.steps=132",
+        "evaluation.at_end=false",
+        "evaluation.every_steps=null",
+        "replay.capacity=1000",
+    )
+    trainer = started(config, tmp_path)
+    tape = []
+    trainer.learner.update = lambda *_: tape.append(len(trainer.memory))  # type: ignore[method-assign]
+    trainer.run()
+
+    naive = []
+    for step in range(1, 133):  # a step is a transition: the memory forgets none here
+        if step % learn_every == 0:
+            # With several environments the updates wait for the next step of all of them, which then is under way.
+            known = step if num_envs == 1 else -(-step // num_envs) * num_envs
+            if known > learn_start and (num_envs == 1 or known < 132):
+                naive.append(known)
+    assert tape == naive
+
+
+def test_a_truncated_episode_bootstraps_and_a_terminated_one_does_not(
+    tiny: Compose, started: Start, tmp_path: Path
+) -> None:
+    config = tiny(
+        "env=atlantis_v5",
+        "env.size=40",
+        "env.max_steps=430",
+        "training.learn_start=990",
+        "phase.quick.steps=900",
+        "replay.capacity=1000",
+        "evaluation.at_end=false",
+        "evaluation.every_steps=null",
+    )
+    trainer = started(config, tmp_path)
+    trainer.actor = ConstantActor(0)  # a game of NOOPs lasts 423 steps
+    trainer.run(after(423))
+    assert [score for _, score in curve(tmp_path, "score/episode")] == [2_000]
+    ends = trainer.memory.state_dict()["terminated"]
+    assert np.flatnonzero(ends).tolist() == [423]
+
+    truncated = started(tiny("env.max_steps=40", "training.learn_start=114"), tmp_path / "truncated")
+    truncated.run(after(100))
+    assert [length for _, length in curve(tmp_path / "truncated", "score/length")] == [40, 40]
+    state = truncated.memory.state_dict()
+    assert not state["terminated"].any()
+    assert np.flatnonzero(state["back"] == 0).tolist() == [0, 41, 82]  # observations that begin an episode
+
+
+def test_curves_of_runs_with_different_num_envs_share_their_steps(
+    tiny: Compose, started: Start, tmp_path: Path
+) -> None:
+    for num_envs in (1, 3):
+        trainer = started(tiny(f"env.num_envs={num_envs}", "env.workers=1"), tmp_path / str(num_envs))
+        trainer.run()
+    steps = [[step for step, _ in curve(tmp_path / name, "actions/epsilon")] for name in ("1", "3")]
+    assert steps[0] == steps[1] == list(range(20, 161, 20))
+
+
+def test_a_plan_in_episodes_ends_with_its_last_episode(tiny: Compose, started: Start, tmp_path: Path) -> None:
+    config = tiny("phase.quick.steps=null", "phase.quick.episodes=3", "evaluation.every_steps=null")
+    trainer = started(config, tmp_path)
+    epsilons = []
+    while trainer.run(after(1)) == "interrupted":
+        epsilons.append((trainer.counters.episodes, trainer.epsilon))
+    assert (trainer.counters.episodes, trainer.counters.steps) == (3, 120)
+    assert dict(epsilons) == {done: trainer.plan.epsilon((done + 1) / 3) for done in range(3)}
+
+
+def test_the_phase_at_a_boundary_is_the_one_that_begins_there() -> None:
+    phases = [Phase("a", 2, 0.1, None), Phase("b", 1, 0.2, None)]  # type: ignore[arg-type]
+    plan = Plan("steps", phases, lambda _: 0.0, 1, 0, 1)
+    assert [plan.phase_at(done).name for done in (0, 1, 2, 3, 9)] == ["a", "a", "b", "b", "b"]
+
+
+def test_a_loss_that_is_no_number_stops_the_run_at_its_last_good_commit(
+    tiny: Compose, started: Start, tmp_path: Path
+) -> None:
+    config = tiny("tracking.every_steps=1000")
+    trainer = started(config, tmp_path)
+    trainer.run(after(100))
+    good = print_of(trainer, tmp_path)
+    next(trainer.learner.network.parameters()).data[:] = np.nan
+    with pytest.raises(Diverged, match=f"update {trainer.learner.updates} is no finite number"):
+        trainer.run()
+    assert print_of(started(config, tmp_path), tmp_path) == good
+
+
+def test_a_run_goes_on_after_its_worker_was_killed(tiny: Compose, started: Start, tmp_path: Path) -> None:
+    config = tiny("env.num_envs=3", "env.workers=2")
+    unbroken = started(config, tmp_path / "unbroken")
+    unbroken.run()
+    trainer = started(config, tmp_path / "broken")
+    trainer.run(after(20))
+    trainer.emulators._processes[1].kill()  # type: ignore[attr-defined]
+    with pytest.raises(WorkerDied, match="SIGKILL"):
+        trainer.run()
+    continued = started(config, tmp_path / "broken")
+    continued.run()
+    assert print_of(continued, tmp_path / "broken") == print_of(unbroken, tmp_path / "unbroken")
+
+
+def test_a_clock_that_steps_back_harms_no_metric(
+    tiny: Compose, started: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ticks = itertools.count(10**18, -(10**12))
+    monkeypatch.setattr("time.time_ns", lambda: next(ticks))
+    trainer = started(tiny(), tmp_path)
+    trainer.run()
+    times = [record.time for _, record in read(tmp_path) if isinstance(record, Metrics)]
+    assert times == sorted(times)
+    assert min(curve(tmp_path, "throughput/hours"))[1] >= 0
