@@ -19,7 +19,7 @@ def main() -> None:
         sys.exit(2)
     else:
         verb = "train"
-    importlib.import_module(f"atlantis_exp.commands.{verb}").main()
+    importlib.import_module(f"atlantis_exp.commands.{verb.replace('-', '_')}").main()
 
 
 if __name__ == "__main__":

@@ -231,7 +231,21 @@ class BudgetConfig:
     """Limits of this command that are no part of the experiment."""
 
     steps: Count | None
+    wall_clock: str | Count | None  # a number alone is in seconds
     forecast: Literal["refuse", "warn", "off"]
+
+    def __post_init__(self) -> None:
+        if self.seconds == 0:
+            raise ConfigError(f"budget.wall_clock={self.wall_clock}: no time; write it as in 90s, 10min, 3h or 1h30m")
+
+    @property
+    def seconds(self) -> int | None:
+        """`wall_clock` in seconds, 0 where it is not readable."""
+        if self.wall_clock is None:
+            return None
+        parts = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m(?:in)?)?(?:(\d+)s?)?", str(self.wall_clock))
+        hours, minutes, seconds = (int(part or 0) for part in parts.groups()) if parts else (0, 0, 0)
+        return 3600 * hours + 60 * minutes + seconds
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)

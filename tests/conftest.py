@@ -13,7 +13,7 @@ from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Trainer
 
 TINY = (  # everything that a training can do, in seconds
-    *("experiment=quick", "device=cpu", "threads=1", "tracking=none", "tracking.every_steps=20"),
+    *("experiment=quick", "device=cpu", "threads=1", "tracking=none", "tracking.every_steps=20", "budget.forecast=off"),
     *("env.size=40", "env.max_steps=40", "phase.quick.steps=160", "replay.capacity=120", "replay.max_bytes=4_194_304"),
     *("training.learn_start=20", "training.learn_every=4", "training.batch_size=4", "training.precision=fp32"),
     *("evaluation.episodes=2", "evaluation.num_envs=1", "evaluation.every_steps=80", "evaluation.video=false"),
@@ -29,6 +29,12 @@ def tiny(tmp_path: Path) -> Callable[..., Config]:
             return checked(Config, compose("config", [*TINY, f"paths.outputs={tmp_path}", *overrides]))
 
     return composed
+
+
+@pytest.fixture
+def tiny_overrides() -> tuple[str, ...]:
+    """What `tiny` composes with, for a process of its own."""
+    return TINY
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ VERBS = {
     "evaluate": "a stored run's network, played again: run=NAME epsilon=0.05",
     "baseline": "a player without a network as a tracked run: agent=random, agent=constant",
     "query": "what the environment is, and what this config makes of it",
+    "verify-resume": "proves, for any training, that killing and continuing it changes no bit",
     "report": "the results that the outputs folder holds, as a table",
     "ui": "the MLflow UI on the local store",
 }

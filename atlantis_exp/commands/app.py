@@ -5,7 +5,8 @@ import itertools
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
@@ -38,7 +39,7 @@ def _outputs_folder() -> str:
 
 def _help(config_name: str) -> str:
     verb = config_name if config_name in VERBS else "train"
-    verbs = "\n".join(f"  {verb:10}{purpose}" for verb, purpose in VERBS.items())
+    verbs = "\n".join(f"  {verb:15}{purpose}" for verb, purpose in VERBS.items())
     return f"python -m atlantis_exp {verb} KEY=VALUE ...\n{VERBS[verb]}\n\n== Verbs ==\n{verbs}\n"
 
 
@@ -46,14 +47,20 @@ OmegaConf.register_new_resolver("outputs_folder", _outputs_folder, replace=True)
 OmegaConf.register_new_resolver("help", _help, replace=True)
 
 
-def run_verb(config_name: str, schema: type[T], job: Callable[[T], None]) -> None:
+def run_verb(
+    config_name: str,
+    schema: type[T],
+    job: Callable[[T], None],
+    sweep: Callable[[Sequence[T]], AbstractContextManager[None]] = lambda _: nullcontext(),
+) -> None:
     """Compose `conf/<config_name>.yaml` with the command line's overrides, check it, and call `job` with the result.
 
     A user's mistake ends the process with exit code 2 and one line on stderr before Hydra or the job starts; a `Fault`
-    ends it with its own exit code and one line, and so does a folder that cannot be written.
+    ends it with its own exit code and one line, and so does a folder that cannot be written. A sweep
+    runs inside of what `sweep` makes of all its jobs' configs.
     """
     try:
-        check(config_name, schema, sys.argv[1:])
+        configs = check(config_name, schema, sys.argv[1:])
     except ConfigError as error:
         _quit(error)
 
@@ -69,7 +76,8 @@ def run_verb(config_name: str, schema: type[T], job: Callable[[T], None]) -> Non
 
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     try:
-        main()
+        with sweep(configs) if len(configs) > 1 else nullcontext():
+            main()
     except (ConfigError, Fault, OSError) as error:
         _quit(error)
 
@@ -89,8 +97,8 @@ def checked(schema: type[T], composed: DictConfig) -> T:
     return parse(schema, {str(key): value for key, value in tree.items()})
 
 
-def check(config_name: str, schema: type[T], arguments: list[str]) -> None:
-    """Compose and check every job that a command line asks for; nothing is written.
+def check(config_name: str, schema: type[T], arguments: list[str]) -> list[T]:
+    """Compose and check every job that a command line asks for; returns their configs, nothing is written.
 
     Raises:
         ConfigError: one line for the first mistake, with the nearest valid choice or the valid range.
@@ -107,8 +115,7 @@ def check(config_name: str, schema: type[T], arguments: list[str]) -> None:
         with initialize_config_dir(str(CONF), version_base="1.3"):
             if hydras:
                 compose(config_name, hydras, return_hydra_config=True)
-            for job in _jobs(overrides):
-                _check_job(config_name, schema, job, known)
+            return [_check_job(config_name, schema, job, known) for job in _jobs(overrides)]
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(" ".join(re.split("Config search path|full_key:", str(error))[0].split())) from None
 
@@ -161,7 +168,7 @@ def _jobs(overrides: list[Override]) -> Iterator[list[str]]:
         yield list(combination)
 
 
-def _check_job(config_name: str, schema: type[T], texts: list[str], known: dict[tuple[str, ...], set[str]]) -> None:
+def _check_job(config_name: str, schema: type[T], texts: list[str], known: dict[tuple[str, ...], set[str]]) -> T:
     """Check one job; `known` keeps the keys that each choice of group options gives, for the sweep's other jobs."""
     overrides = {text: _read_override(text) for text in texts}
     groups = _groups(config_name)
@@ -191,7 +198,7 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], known: dict[
         if override.is_delete() and not key.startswith("phase."):
             raise ConfigError(f"{text}: needed; change it with {key}=VALUE")
     try:
-        checked(schema, compose(config_name, texts))
+        return checked(schema, compose(config_name, texts))
     except InterpolationKeyError as error:
         missing = "".join(re.findall("'(.*)'", str(error)))
         raise ConfigError(f"${{{missing}}}: no such key; {_nearest_key(missing, keys)}") from None
@@ -199,8 +206,9 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], known: dict[
 
 def _groups(config_name: str) -> set[str]:
     """The groups of a verb's defaults list, with the package that they fill: `model`, `sampler@samplers.uniform`."""
-    defaults = OmegaConf.load(CONF / f"{config_name}.yaml").get("defaults", [])
-    return {str(group) for entry in defaults if isinstance(entry, DictConfig) for group in entry}
+    config = OmegaConf.load(CONF / f"{config_name}.yaml")
+    assert isinstance(config, DictConfig)
+    return {str(group) for entry in config.defaults if isinstance(entry, DictConfig) for group in entry}
 
 
 def _key(override: Override) -> str:

@@ -11,9 +11,10 @@ from atlantis_exp.config import ReportConfig
 
 def report(config: ReportConfig) -> None:
     """Print every run's evaluation, and how to look further."""
-    from atlantis_exp.commands.runs import all_runs
+    from atlantis_exp.commands.runs import all_runs, settle
 
     outputs = Path(config.paths.outputs)
+    settle(outputs)
     runs = all_runs(outputs)
     if not runs:
         print(f"there is no run under {outputs / 'runs'} yet")
@@ -25,7 +26,7 @@ def report(config: ReportConfig) -> None:
     for run in runs:
         result = run.result
         if result is None or not result["evaluation"]:
-            table.add_row(run.name, "unfinished" if result is None else f"{result['steps']:,}")
+            table.add_row(run.name, run.state if result is None else f"{result['steps']:,}")
             continue
         scores = {
             key.split("/")[1]: value for key, value in result["evaluation"].items() if key.startswith("evaluation/")

@@ -5,22 +5,26 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TextIO, get_args
 
 from atlantis_exp.config import ConfigError, TrackingConfig, flatten, nearest
 from atlantis_exp.faults import Fault
 from atlantis_exp.media import score_histogram
-from atlantis_exp.tracking.journal import Journal, write_file
+from atlantis_exp.tracking.journal import Journal, read_commit, write_file
 from atlantis_exp.tracking.store import Publisher, Store
 from atlantis_exp.training.evaluation import Evaluation
 
-_DRAIN_SECONDS = 120.0  # that a command waits for MLflow at its end
+_DRAIN_SECONDS = 20.0  # that a command waits for MLflow at its end; `settle` sends what is missing then
+_HOLD_SECONDS = 2.0  # that a command waits for a run, which `settle` may hold for a moment
 _LIBRARIES = ("atlantis-exp", "ale-py", "gymnasium", "torch", "numpy", "opencv-python-headless", "hydra-core", "mlflow")
+
+State = Literal["done", "running", "failed", "interrupted", "missing"]
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,25 @@ class RunFolder:
         """How the run ended, None before its end."""
         return _read_json(self.path / "result.json")
 
+    @property
+    def state(self) -> State:
+        """How the run stands; one whose process was killed is interrupted, whatever its journal says."""
+        if self.result is not None:
+            return "done"
+        if self.config is None:
+            return "missing"
+        commit = read_commit(self.path)
+        if commit is not None and commit.status == "FAILED":
+            return "failed"
+        return "running" if commit is not None and commit.status == "RUNNING" and self._is_held() else "interrupted"
+
+    def _is_held(self) -> bool:
+        path = self.path / "lock"
+        if not path.exists():
+            return False
+        with open(path, "a+") as file:
+            return not _locked(file)
+
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Keep the composed config."""
         write_file(self.path / "config.json", json.dumps(config, indent=2).encode())
@@ -57,15 +80,55 @@ class RunFolder:
         """Hold the run against other processes. Raises: Fault, naming the one that holds it."""
         self.path.mkdir(parents=True, exist_ok=True)
         with open(self.path / "lock", "a+") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                file.seek(0)
-                raise Fault(f"run {self.name} is held by {file.read().strip()}", exit_code=75) from None
+            patience = time.monotonic() + _HOLD_SECONDS
+            while not _locked(file):
+                if time.monotonic() > patience:
+                    file.seek(0)
+                    raise Fault(f"run {self.name} is held by {file.read().strip()}", exit_code=75)
+                time.sleep(0.05)
             file.truncate(0)
             file.write(f"process {os.getpid()} on {os.uname().nodename}\n")
             file.flush()
             yield  # the kernel lets go when the process ends, however it does
+
+
+def settle(outputs: Path) -> None:
+    """Say of runs whose process was killed that they are interrupted, and send MLflow what a command had to leave."""
+    for path in sorted((outputs / "runs").glob("*/commit.json")):
+        folder, commit = RunFolder(path.parent), read_commit(path.parent)
+        if commit is not None and commit.status == "RUNNING" and not folder._is_held():
+            with suppress(Fault), folder.held():
+                Journal(folder.path).status("KILLED")
+                print(f"run {folder.name} was killed; the command that started it continues it")
+        mirrored = _read_json(folder.path / "published.json")
+        commit = read_commit(folder.path)
+        if mirrored is None or commit is None or commit.status == "RUNNING":
+            continue
+        if (mirrored["identity"], mirrored["offset"], mirrored["status"]) != (
+            commit.identity,
+            commit.offset,
+            commit.status,
+        ):
+            publisher = Publisher(folder.path, Store(outputs, mirrored["store"].rpartition("#")[2]))
+            publisher.drain(_DRAIN_SECONDS)
+
+
+@contextmanager
+def ledger(folders: Sequence[RunFolder]) -> Iterator[None]:
+    """A sweep's table of runs, before and after it."""
+    _print_table(folders)
+    try:
+        yield
+    finally:
+        _print_table(folders)
+
+
+def _print_table(folders: Sequence[RunFolder]) -> None:
+    states = [folder.state for folder in folders]
+    for folder, state in zip(folders, states, strict=True):
+        print(f"  {state:12}{folder.name}")
+    counts = ", ".join(f"{states.count(state)} {state}" for state in get_args(State) if state in states)
+    print(f"sweep of {len(folders)} runs: {counts}", flush=True)
 
 
 def find_run(outputs: Path, name: str) -> RunFolder:
@@ -161,6 +224,15 @@ def record_evaluation(
             }
         )
     print(f"recorded as {folder.name} in {folder.path}")
+
+
+def _locked(file: TextIO) -> bool:
+    """Whether the lock is this process's now; it is until the file is closed."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _read_json(path: Path) -> dict[str, Any] | None:

@@ -1,12 +1,16 @@
 """`python -m atlantis_exp [train] overrides`: one run; the same command again continues or reports it."""
 
+import os
 import shlex
 import signal
 import sys
-from contextlib import contextmanager
+import time
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
+from math import inf
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from atlantis_exp.commands.app import run_verb
 from atlantis_exp.config import Config, ConfigError, flatten, to_dict
@@ -20,26 +24,45 @@ if TYPE_CHECKING:
 
 
 class StopRequest:
-    """Turns the first SIGINT, SIGTERM or SIGUSR2 into a flag that the trainer looks at after every step.
+    """Turns the first SIGINT, SIGTERM or SIGUSR2, or the end of the time, into a flag that the trainer looks at.
 
-    A second SIGINT ends the process at once; what was committed stays.
+    A second SIGINT ends the process at once; what was committed stays. Under Slurm SIGTERM is a warning: the run is
+    committed and goes on, since Slurm itself requeues or kills it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, seconds: float | None = None) -> None:
         self.signal: int | None = None
+        self._deadline = inf if seconds is None else time.monotonic() + seconds
+        self._before: dict[int, Any] = {}  # handlers
 
     def __call__(self) -> bool:
-        return self.signal is not None
+        return self.signal is not None or time.monotonic() >= self._deadline
+
+    def was_a_warning(self) -> bool:
+        """Whether the run is to go on once it is committed; forgets the warning."""
+        if self.signal != signal.SIGTERM or "SLURM_JOB_ID" not in os.environ:
+            return False
+        self.signal = None
+        return True
+
+    def leave(self, message: str) -> NoReturn:
+        """End the process as the request wants it; raises Fault for the end of the time, so that a sweep goes on."""
+        if self.signal is None:
+            raise Fault(f"budget.wall_clock: {message}", exit_code=124)  # as of timeout(1)
+        print(f"atlantis_exp: {signal.Signals(self.signal).name}: {message}", file=sys.stderr, flush=True)
+        if self.signal == signal.SIGUSR2 and callable(handler := self._before[signal.SIGUSR2]):
+            handler(self.signal, None)  # submitit's own requeues the job and exits
+        sys.exit(128 + self.signal)
 
     @contextmanager
     def installed(self) -> "Iterator[None]":
         """Listen while the block runs."""
         signals = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
-        before = {number: signal.signal(number, self._receive) for number in signals}
+        self._before = {number: signal.signal(number, self._receive) for number in signals}
         try:
             yield
         finally:
-            for number, handler in before.items():
+            for number, handler in self._before.items():
                 signal.signal(number, handler)
 
     def _receive(self, number: int, _: FrameType | None) -> None:
@@ -51,9 +74,10 @@ class StopRequest:
 
 def train(config: Config) -> None:
     """Start the run that this config is, continue it, or print its result if it has ended."""
-    from atlantis_exp.commands.runs import RunFolder
+    from atlantis_exp.commands.runs import RunFolder, settle
 
     outputs = Path(config.paths.outputs)
+    settle(outputs)
     folder = RunFolder(outputs / "runs" / config.run_name())
     if config.resume == "must" and folder.config is None:
         raise ConfigError(f"resume=must: there is no run {folder.name} under {outputs / 'runs'}")
@@ -82,6 +106,7 @@ def _train(config: Config, folder: Any) -> None:
     from atlantis_exp.build import build_trainer
     from atlantis_exp.commands.runs import provenance, published
     from atlantis_exp.game.vector import WorkerDied
+    from atlantis_exp.tracking.journal import JournalError
     from atlantis_exp.training.checkpoint import CheckpointError
     from atlantis_exp.training.progress import Progress
     from atlantis_exp.training.trainer import Diverged
@@ -89,7 +114,7 @@ def _train(config: Config, folder: Any) -> None:
     progress = Progress()
     outputs = Path(config.paths.outputs)
     command = shlex.join(["python", "-m", "atlantis_exp", *sys.argv[1:]])
-    stop = StopRequest()
+    stop = StopRequest(config.budget.seconds)
     with stop.installed(), published(folder, config.tracking.name, outputs, config.tracking.experiment) as journal:
         trainer = build_trainer(config, folder.path, journal, progress)
         try:
@@ -107,23 +132,21 @@ def _train(config: Config, folder: Any) -> None:
             if config.budget.forecast != "off":
                 _check_forecast(config, trainer.counters.steps, progress)
             outcome = trainer.run(stop)
-        except (WorkerDied, CheckpointError, Diverged, OSError) as error:
-            journal.status("FAILED")
-            raise Fault(f"run {folder.name}: {error}; continue with: {command}") from error
-        except BaseException:
-            journal.status("FAILED")
+            while outcome == "interrupted" and stop.was_a_warning():
+                progress.say(f"SIGTERM: committed at step {trainer.counters.steps:,}, going on until Slurm ends it")
+                outcome = trainer.run(stop)
+        except BaseException as error:
+            with suppress(OSError):  # a full disk takes no status either; the next command sees that nobody holds it
+                journal.status("FAILED")
+            if isinstance(error, WorkerDied | CheckpointError | Diverged | OSError | JournalError):
+                raise Fault(f"run {folder.name}: {error}; continue with: {command}") from error
             raise
         finally:
             progress.close()
             trainer.emulators.close()
         journal.status("KILLED" if outcome == "interrupted" else "FINISHED")
     if outcome == "interrupted":
-        assert stop.signal is not None
-        name = signal.Signals(stop.signal).name
-        steps = trainer.counters.steps
-        raise Fault(
-            f"{name}: run {folder.name} is committed at step {steps:,}; continue with: {command}", 128 + stop.signal
-        )
+        stop.leave(f"run {folder.name} is committed at step {trainer.counters.steps:,}; continue with: {command}")
     report = trainer.last_report or "no evaluation (evaluation.at_end=false)"
     folder.write_result(
         {
@@ -162,6 +185,14 @@ def _facts(trainer: "Trainer") -> dict[str, str]:
     }
 
 
+def sweep_ledger(configs: Sequence[Config]) -> AbstractContextManager[None]:
+    """A sweep's table of runs, before and after it."""
+    from atlantis_exp.commands.runs import RunFolder, ledger
+
+    runs = dict.fromkeys(Path(config.paths.outputs) / "runs" / config.run_name() for config in configs)
+    return ledger([RunFolder(path) for path in runs])
+
+
 def main() -> None:
     """Compose and train."""
-    run_verb("config", Config, train)
+    run_verb("config", Config, train, sweep_ledger)

@@ -89,6 +89,10 @@ class Commit:
     status: Status
 
 
+class JournalError(ValueError):
+    """A journal that cannot be continued from."""
+
+
 class Tracker(Protocol):
     """What training may tell about itself."""
 
@@ -209,7 +213,7 @@ class Journal:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         path = self._folder / "journal.jsonl"
         if path.stat().st_size < state["offset"]:
-            raise ValueError(f"{path} is shorter than the checkpoint says: it was cut or replaced since")
+            raise JournalError(f"{path} is shorter than the checkpoint says: it was cut or replaced since")
         self._offset, self._time = state["offset"], state["time"]
         self._lines.clear()
 

@@ -289,6 +289,7 @@ class _Mirror:
             self._client.update_run(self._run_id, commit.status)
         else:
             self._client.set_terminated(self._run_id, commit.status, commit.updated)
+        self._send_tags({"resumable": str(commit.status in ("KILLED", "FAILED")).lower()})
 
     def send(self, record: Params | Tags | Artifact | Image | Model) -> None:
         if isinstance(record, Artifact | Image | Model) and not (self._artifacts / record.path).exists():

@@ -1,0 +1,300 @@
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from atlantis_exp.commands.runs import RunFolder, settle
+from atlantis_exp.commands.train import StopRequest, train
+from atlantis_exp.commands.verify_resume import fingerprints, train_and_kill
+from atlantis_exp.config import Config, ConfigError
+from atlantis_exp.faults import Fault
+from atlantis_exp.tracking.journal import Metrics, read, read_commit
+
+Compose = Callable[..., Config]
+REPOSITORY = Path(__file__).parents[2]
+COMMAND = (sys.executable, "-m", "atlantis_exp")
+LONG = ("phase.quick.steps=100_000", "evaluation.every_steps=null", "tracking.commit_seconds=0.2")
+
+
+def run_of(config: Config) -> RunFolder:
+    return RunFolder(Path(config.paths.outputs) / "runs" / config.run_name())
+
+
+def session(config: Config, tiny_overrides: tuple[str, ...], *overrides: str, **environment: str) -> Any:
+    """A training in a process of its own."""
+    return subprocess.Popen(
+        (*COMMAND, "train", *tiny_overrides, f"paths.outputs={config.paths.outputs}", *overrides),
+        cwd=REPOSITORY,
+        env={**os.environ, **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def committed(folder: RunFolder) -> bool:
+    return any((folder.path / "checkpoints").glob("0*/manifest.json"))
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    patience = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < patience
+        time.sleep(0.02)
+
+
+def test_a_run_that_has_ended_is_reported_and_not_trained_again(
+    tiny: Compose, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tiny("evaluation.every_steps=null")
+    train(config)
+    folder = run_of(config)
+    files = {path: path.stat().st_mtime_ns for path in folder.path.rglob("*")}
+    capsys.readouterr()
+    train(config)
+    assert f"run {folder.name} has ended (finished after 160 steps)" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in folder.path.rglob("*")} == files
+    assert folder.state == "done"
+
+
+def test_a_larger_budget_continues_a_run_that_its_budget_ended(tiny: Compose) -> None:
+    for steps in ("80", "120", "null"):
+        config = tiny(f"budget.steps={steps}", "evaluation.at_end=false", "evaluation.every_steps=null")
+        train(config)
+    result = run_of(config).result
+    assert result is not None
+    assert (result["outcome"], result["steps"]) == ("finished", 160)
+    unbroken = tiny("evaluation.at_end=false", "evaluation.every_steps=null", f"paths.outputs={config.paths.outputs}/u")
+    train(unbroken)
+    assert fingerprints(config, Path(config.paths.outputs)) == fingerprints(unbroken, Path(unbroken.paths.outputs))
+
+
+def test_resume_must_refuses_to_start_and_resume_never_keeps_what_was_there(tiny: Compose) -> None:
+    short = ("phase.quick.steps=40", "evaluation.at_end=false", "evaluation.every_steps=null")
+    with pytest.raises(ConfigError, match="resume=must: there is no run"):
+        train(tiny(*short, "resume=must"))
+    for resume in ("auto", "must", "never"):
+        config = tiny(*short, f"resume={resume}")
+        train(config)
+    names = sorted(path.name for path in run_of(config).path.parent.iterdir())
+    assert names == [config.run_name(), f"{config.run_name()}~1"]
+
+
+def test_a_run_that_another_process_holds_is_not_touched(tiny: Compose) -> None:
+    config = tiny()
+    folder = run_of(config)
+    holder = f"process {os.getpid()} on {os.uname().nodename}"
+    with folder.held(), pytest.raises(Fault, match=f"run {folder.name} is held by {holder}") as fault:
+        train(config)
+    assert fault.value.exit_code == 75
+    (folder.path / "lock").write_text("process 1 on a machine long gone\n")
+    with folder.held():
+        pass
+
+
+def test_time_that_is_up_commits_and_says_how_to_continue(tiny: Compose) -> None:
+    config = tiny("budget.wall_clock=1s", *LONG)
+    with pytest.raises(Fault, match=r"budget\.wall_clock: run .* is committed at step .*; continue with: ") as fault:
+        train(config)
+    assert fault.value.exit_code == 124
+    assert run_of(config).state == "interrupted"
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("90", 90), ("90s", 90), ("10min", 600), ("10m", 600), ("3h", 10_800), ("1h30m", 5_400)]
+)
+def test_a_time_is_read_in_the_usual_ways_and_is_no_part_of_the_identity(
+    tiny: Compose, text: str, seconds: int
+) -> None:
+    config = tiny(f"budget.wall_clock={text}")
+    assert config.budget.seconds == seconds
+    assert config.identity() == tiny().identity()
+
+
+@pytest.mark.parametrize("text", ["3x", "0", "h", "-3h", "'3 h'"])
+def test_a_time_that_is_none_is_refused_in_one_line(tiny: Compose, text: str) -> None:
+    with pytest.raises(ConfigError, match=r"budget\.wall_clock"):
+        tiny(f"budget.wall_clock={text}")
+
+
+def test_a_second_interrupt_ends_the_process_at_once() -> None:
+    stop = StopRequest()
+    with stop.installed():
+        signal.raise_signal(signal.SIGTERM)
+        assert stop()
+        with pytest.raises(SystemExit) as ended:
+            stop.leave("done")
+    assert ended.value.code == 143
+    code = (
+        "import signal; from atlantis_exp.commands.train import StopRequest\n"
+        "with StopRequest().installed(): [signal.raise_signal(signal.SIGINT) for _ in range(2)]"
+    )
+    assert subprocess.run((sys.executable, "-c", code), cwd=REPOSITORY, check=False).returncode == -signal.SIGINT
+
+
+def test_under_slurm_sigterm_is_a_warning_and_sigusr2_goes_on_to_the_handler_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("SLURM_JOB_ID", "7")
+    tape = []
+    before = signal.signal(signal.SIGUSR2, lambda number, _: tape.append(number))
+    try:
+        stop = StopRequest()
+        with stop.installed():
+            signal.raise_signal(signal.SIGTERM)
+            assert stop()
+            assert stop.was_a_warning()
+            assert not stop()
+            signal.raise_signal(signal.SIGUSR2)
+            assert stop()
+            assert not stop.was_a_warning()
+            assert tape == []
+            with pytest.raises(SystemExit):
+                stop.leave("done")
+        assert tape == [signal.SIGUSR2]
+    finally:
+        signal.signal(signal.SIGUSR2, before)
+
+
+def test_a_disk_without_space_is_one_clear_line_and_costs_nothing_committed(
+    tiny: Compose, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = tiny("tracking.commit_seconds=1e-9", "evaluation.every_steps=null")
+    synced, calls = os.fsync, iter(range(100))
+
+    def full(file: int) -> None:
+        if next(calls, None) is None:
+            raise OSError(28, "No space left on device")
+        synced(file)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(Fault, match="No space left on device; continue with: "):
+            train(config)
+    folder = run_of(config)
+    assert folder.state == "interrupted"
+    train(config)
+    unbroken = tiny("evaluation.every_steps=null", f"paths.outputs={config.paths.outputs}/unbroken")
+    train(unbroken)
+    assert fingerprints(config, Path(config.paths.outputs)) == fingerprints(unbroken, Path(unbroken.paths.outputs))
+
+
+def test_a_journal_that_was_cut_is_one_clear_line(tiny: Compose) -> None:
+    config = tiny("budget.steps=80", "evaluation.at_end=false", "evaluation.every_steps=null")
+    train(config)
+    path = run_of(config).path / "journal.jsonl"
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(Fault, match="is shorter than the checkpoint says"):
+        train(tiny("evaluation.at_end=false", "evaluation.every_steps=null"))
+
+
+def points(outputs: Path, name: str) -> list[tuple[Any, ...]]:
+    with closing(sqlite3.connect(outputs / "mlflow.db")) as database:
+        return database.execute(
+            "SELECT key, step, timestamp, value FROM metrics JOIN runs USING (run_uuid) WHERE name = ? AND "
+            "lifecycle_stage = 'active' ORDER BY key, timestamp, step",
+            (name,),
+        ).fetchall()
+
+
+def test_a_killed_run_is_shown_as_interrupted_then_continued_and_sigterm_ends_it_with_143(
+    tiny: Compose, tiny_overrides: tuple[str, ...]
+) -> None:
+    """With MLflow: one run, whose points are those of the journal, each once."""
+    chosen = ("tracking=mlflow", "tracking.every_steps=20", *LONG)
+    config = tiny(*chosen)
+    folder, outputs = run_of(config), Path(config.paths.outputs)
+
+    killed = session(config, tiny_overrides, *chosen)
+    wait_for(lambda: committed(folder) and (folder.path / "published.json").exists())
+    assert str(folder.state) == "running"
+    with pytest.raises(Fault, match=f"is held by process {killed.pid} on"), folder.held():
+        pass
+    killed.kill()
+    killed.wait()
+    assert folder.state == "interrupted"
+    settle(outputs)
+    with closing(sqlite3.connect(outputs / "mlflow.db")) as database:
+        rows = database.execute(
+            "SELECT status, value FROM runs JOIN tags USING (run_uuid) WHERE key = 'resumable'"
+        ).fetchall()
+    assert rows == [("KILLED", "true")]
+
+    generations = max(path.parent.name for path in folder.path.glob("checkpoints/0*/manifest.json"))
+    ended = session(config, tiny_overrides, *chosen)
+    wait_for(lambda: max(path.parent.name for path in folder.path.glob("checkpoints/0*/manifest.json")) > generations)
+    ended.send_signal(signal.SIGTERM)
+    out, error = ended.communicate()
+    assert ended.returncode == 143
+    assert f"continuing run {folder.name} at step" in out
+    assert error.startswith(f"atlantis_exp: SIGTERM: run {folder.name} is committed at step")
+    assert "continue with: python -m atlantis_exp experiment=quick" in error
+    commit = read_commit(folder.path)
+    assert commit is not None
+    assert commit.status == "KILLED"
+    journaled = [
+        (key, record.step, record.time, value)
+        for _, record in read(folder.path)
+        if isinstance(record, Metrics)
+        for key, value in record.values.items()
+    ]
+    assert points(outputs, folder.name) == sorted(journaled, key=lambda point: (point[0], point[2], point[1]))
+    assert len({(key, step) for key, step, _, _ in journaled if key == "actions/epsilon"}) == len(
+        [key for key, _, _, _ in journaled if key == "actions/epsilon"]
+    )
+    with closing(sqlite3.connect(outputs / "mlflow.db")) as database:
+        assert database.execute("SELECT count(*) FROM runs").fetchall() == [(1,)]
+
+
+def test_a_sweep_runs_what_is_missing_and_tables_what_it_found(tiny: Compose, tiny_overrides: tuple[str, ...]) -> None:
+    short = ("phase.quick.steps=40", "evaluation.at_end=false", "evaluation.every_steps=null")
+    config = tiny(*short)
+    train(config)
+    missing = tiny(*short, "seed=1")
+    done, error = session(config, tiny_overrides, *short, "seed=0,1", "-m").communicate()
+    assert error == ""
+    tables = [line for line in done.splitlines() if line.startswith("sweep of 2 runs")]
+    assert tables == ["sweep of 2 runs: 1 done, 1 missing", "sweep of 2 runs: 2 done"]
+    assert f"run {config.run_name()} has ended" in done
+    assert f"starting run {missing.run_name()}" in done
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("model=cnn", "env.num_envs=1", "phase.quick.steps=30_000"),
+        ("model=resnet", "env.size=16", "env.num_envs=8", "env.workers=2", "phase.quick.steps=30_000"),
+    ],
+)
+def test_a_training_killed_twenty_times_is_the_unbroken_one(
+    tiny: Compose, tiny_overrides: tuple[str, ...], tmp_path: Path, overrides: tuple[str, ...]
+) -> None:
+    chosen = (*overrides, "evaluation.every_steps=null", "tracking.histogram_episodes=100")
+    config = tiny(*chosen)
+    assert train_and_kill(config, (*tiny_overrides, *chosen), tmp_path / "unbroken", 0) == 0
+    struck = train_and_kill(config, (*tiny_overrides, *chosen), tmp_path / "killed", 20)
+    assert struck >= 10
+    assert fingerprints(config, tmp_path / "unbroken") == fingerprints(config, tmp_path / "killed")
+
+
+@pytest.mark.slow
+def test_verify_resume_records_its_verdict(tiny_overrides: tuple[str, ...], tmp_path: Path) -> None:
+    overrides = (*tiny_overrides, "phase.quick.steps=4_000", "evaluation.every_steps=null", f"paths.outputs={tmp_path}")
+    done = subprocess.run(
+        (*COMMAND, "verify-resume", *overrides), cwd=REPOSITORY, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1].endswith("is the unbroken one, bit for bit")
+    [path] = (tmp_path / "verifications").glob("*/artifacts/fingerprints.json")
+    hashes = json.loads(path.read_bytes())
+    assert hashes["unbroken"] == hashes["killed"]
