@@ -32,7 +32,7 @@ from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate, replay
 from atlantis_exp.training.forecast import Forecast, forecast
 from atlantis_exp.training.progress import Progress
-from atlantis_exp.training.trainer import Cadence, Phase, Plan, Trainer, film_of
+from atlantis_exp.training.trainer import Cadence, Evaluate, Phase, Plan, Trainer, film_of
 
 # The registry: a schema class of `config` to the class that it configures.
 NETWORKS: dict[type, type[nn.Module]] = {cfg.CnnConfig: DQNCnn, cfg.ResNetConfig: ResNetDQN}
@@ -156,9 +156,17 @@ def build_plan(config: cfg.Config) -> Plan:
 
 
 def run_evaluation(
-    actor: Actor, env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig, progress: Progress
+    actor: Actor,
+    env: cfg.EnvConfig,
+    evaluation: cfg.EvaluationConfig,
+    progress: Progress,
+    stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Evaluation, bytes | None]:
-    """Evaluate an actor on emulators of its own; with the film of the best episode where the config asks for it."""
+    """Evaluate an actor on emulators of its own; with the film of the best episode where the config asks for it.
+
+    Raises:
+        Stopped: when `stop` says so.
+    """
     played = 0
 
     def on_episode(episode: Episode) -> None:
@@ -176,6 +184,7 @@ def run_evaluation(
             size=env.size,
             stack=env.stack,
             on_episode=on_episode,
+            stop=stop,
         )
     if not evaluation.video:
         return result, None
@@ -233,9 +242,7 @@ def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: 
     env = config.env
     learner = build_learner(config)
     actor = EpsilonGreedy(learner.q_values, len(ACTIONS))
-    evaluation: Callable[[Progress], tuple[Evaluation, bytes | None]] = partial(
-        run_evaluation, actor, env, config.evaluation
-    )
+    evaluation: Evaluate = partial(run_evaluation, actor, env, config.evaluation)
     return Trainer(
         plan=build_plan(config),
         cadence=Cadence(

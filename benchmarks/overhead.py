@@ -85,7 +85,7 @@ def training(tracked: bool, commit_seconds: float) -> Iterator[Measure[Turn]]:
     with learning(config, tracker_of) as trainer:
         tracker = Timed(trainer.tracker)
         trainer.tracker = cast(Tracker, tracker)
-        trainer.evaluate = lambda _: (_evaluation(), None)
+        trainer.evaluate = lambda *_: (_evaluation(), None)
         clocks = [
             time.pthread_getcpuclockid(thread.ident)
             for thread in threading.enumerate()

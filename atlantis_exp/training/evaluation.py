@@ -16,6 +16,10 @@ from atlantis_exp.statistics import Summary, summarize
 from atlantis_exp.training.actor import Actor
 
 
+class Stopped(Exception):
+    """An evaluation was asked to stop; nothing of it is kept."""
+
+
 @dataclass
 class Episode:
     """One evaluated episode; its seed and actions are all that is needed to see it again."""
@@ -125,10 +129,14 @@ def evaluate(
     size: int,
     stack: int,
     on_episode: Callable[[Episode], None] = lambda _: None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Evaluation:
     """Play `episodes` episodes side by side; what each is like depends on `seed` and its own index alone.
 
     size in pixels and stack in observations, as the actor's states want them.
+
+    Raises:
+        Stopped: when `stop`, which is asked before every step, says so.
     """
     played = [Episode(_seed_sequence(seed, index).generate_state(1).item()) for index in range(episodes)]
     streams = [np.random.default_rng(_seed_sequence(seed, index).spawn(1)[0]) for index in range(episodes)]
@@ -147,6 +155,8 @@ def evaluate(
     for env in range(min(emulators.num_envs, episodes)):
         begin(env)
     while playing:
+        if stop():
+            raise Stopped
         envs = np.array(sorted(playing))
         decisions = actor.act(stacks.state[envs], epsilon, [streams[playing[env]] for env in envs])
         steps = emulators.step(decisions.actions, envs)

@@ -19,11 +19,13 @@ from atlantis_exp.replay.samplers import Sampler
 from atlantis_exp.tracking.journal import Tracker
 from atlantis_exp.training.actor import Actor, Decisions
 from atlantis_exp.training.checkpoint import Checkpoints
-from atlantis_exp.training.evaluation import Evaluation
+from atlantis_exp.training.evaluation import Evaluation, Stopped
 from atlantis_exp.training.progress import Progress
 
 Unit = Literal["episodes", "steps"]
 Outcome = Literal["finished", "budget", "interrupted"]
+Stop = Callable[[], bool]
+Evaluate = Callable[[Progress, Stop], tuple[Evaluation, bytes | None]]
 
 
 class Diverged(RuntimeError):
@@ -112,7 +114,7 @@ class Trainer:
         seeds: Sequence[int],
         tracker: Tracker,
         checkpoints: Checkpoints,
-        evaluate: Callable[[Progress], tuple[Evaluation, bytes | None]],
+        evaluate: Evaluate,
         progress: Progress,
         max_steps: int | None,
     ) -> None:
@@ -129,11 +131,12 @@ class Trainer:
         self.recent_lengths: deque[int] = deque(maxlen=100)  # steps
         self.best_mean = -np.inf  # of all evaluations
         self.evaluated_at = -1  # steps
+        self.owes_evaluation = False  # of this very step: it was asked to stop
         self.best_step = -1
         self.last_report = ""  # of the latest evaluation
         self.last_metrics: dict[str, float] = {}  # of the latest evaluation
 
-    def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
+    def run(self, stop: Stop = lambda: False) -> Outcome:
         """Train from where the counters stand; commits before it returns.
 
         Raises:
@@ -145,14 +148,16 @@ class Trainer:
             self._begin_all()
         self._session_start = time.monotonic() - self.counters.seconds
         self._last_commit = time.monotonic()
+        self._stop = stop
+        if self.owes_evaluation:
+            self._evaluate()
         while not self._ended and not stop():
             self._iterate()
-        if not self._ended:
-            self.commit()
-            return "interrupted"
-        if self.cadence.evaluate_at_end and self.evaluated_at != self.counters.steps:
+        if self._ended and self.cadence.evaluate_at_end:
             self._evaluate()
         self.commit()
+        if not self._ended or self.owes_evaluation:
+            return "interrupted"
         return "finished" if self.done >= self.plan.length else "budget"
 
     @property
@@ -190,6 +195,7 @@ class Trainer:
             "recent_lengths": list(self.recent_lengths),
             "best_mean": None if np.isinf(self.best_mean) else self.best_mean,
             "evaluated_at": self.evaluated_at,
+            "owes_evaluation": self.owes_evaluation,
             "best_step": self.best_step,
             "last_report": self.last_report,
             "last_metrics": self.last_metrics,
@@ -209,6 +215,7 @@ class Trainer:
         self.recent_lengths.extend(state["recent_lengths"])
         self.best_mean = -np.inf if state["best_mean"] is None else state["best_mean"]
         self.evaluated_at = state["evaluated_at"]
+        self.owes_evaluation = state["owes_evaluation"]
         self.best_step = state["best_step"]
         self.last_report, self.last_metrics = state["last_report"], state["last_metrics"]
         self.tracker.load_state_dict(state["tracker"])
@@ -343,7 +350,12 @@ class Trainer:
         step = self.counters.steps
         if step == self.evaluated_at:
             return
-        evaluation, video = self.evaluate(self.progress)
+        self.owes_evaluation = True
+        try:
+            evaluation, video = self.evaluate(self.progress, self._stop)
+        except Stopped:
+            return
+        self.owes_evaluation = False
         metrics = {**evaluation.metrics(), "throughput/episodes": self.counters.episodes}
         self.tracker.metrics(metrics, step)
         scores = [episode.score for episode in evaluation.episodes]

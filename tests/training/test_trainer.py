@@ -266,6 +266,23 @@ def test_a_loss_that_is_no_number_stops_the_run_at_its_last_good_commit(
     assert print_of(started(config, tmp_path), tmp_path) == good
 
 
+@pytest.mark.parametrize("step", [80, 120])  # one amid the training, the one at its end
+def test_an_evaluation_that_is_asked_to_stop_is_made_good(
+    tiny: Compose, started: Start, tmp_path: Path, step: int
+) -> None:
+    config = tiny("phase.quick.steps=120")
+    unbroken = started(config, tmp_path / "unbroken")
+    unbroken.run()
+    stopped = started(config, tmp_path / "broken")
+    asked = after(30)
+    assert stopped.run(lambda: stopped.counters.steps == step and asked()) == "interrupted"
+    assert (stopped.counters.steps, stopped.owes_evaluation) == (step, True)
+    assert step not in dict(curve(tmp_path / "broken", "evaluation/mean"))
+    continued = started(config, tmp_path / "broken")
+    assert continued.run() == "finished"
+    assert print_of(continued, tmp_path / "broken") == print_of(unbroken, tmp_path / "unbroken")
+
+
 def test_a_run_goes_on_after_its_worker_was_killed(tiny: Compose, started: Start, tmp_path: Path) -> None:
     config = tiny("env.num_envs=3", "env.workers=2")
     unbroken = started(config, tmp_path / "unbroken")
