@@ -12,6 +12,7 @@ import torch
 
 from atlantis_exp.config import Config
 from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.tracking.journal import read_commit
 from atlantis_exp.training.checkpoint import FORMAT, CheckpointError, Checkpoints, _checksum
 from atlantis_exp.training.fingerprint import fingerprint
 from atlantis_exp.training.trainer import Trainer
@@ -244,17 +245,16 @@ def test_a_death_at_any_file_operation_of_a_commit_leaves_the_commit_before_or_t
         shutil.copytree(tmp_path / "base", folder)
         if not die_in_commit(dying, folder, len(steps)):
             break
+        memory = ReplayMemory(config.replay.capacity, (40, 40), budget_bytes=config.replay.max_bytes)
+        state, mark = Checkpoints(folder / "checkpoints", config.identity()).load(memory), read_commit(folder)
+        assert state is not None
+        assert mark is not None
+        assert mark.offset <= state["tracker"]["offset"]  # nothing is shown that no checkpoint backs
+        steps.append(state["counters"]["steps"])
         if continued:
             after = started(config, folder)
-            steps.append(after.counters.steps)
             after.run()
             assert fingerprint(after.state_dict(), after.memory, folder) == goal
-        else:
-            state = Checkpoints(folder / "checkpoints", config.identity()).load(
-                ReplayMemory(config.replay.capacity, (40, 40), budget_bytes=config.replay.max_bytes)
-            )
-            assert state is not None
-            steps.append(state["counters"]["steps"])
     assert steps == sorted(steps)
     assert set(steps) == {100, 160}
     assert len(steps) > 20

@@ -90,7 +90,7 @@ def test_a_training_killed_in_every_phase_is_the_unbroken_one_bit_for_bit(
     config = tiny(*TWO_PHASES, *overrides)
     unbroken = started(config, tmp_path / "unbroken")
     unbroken.run()
-    for iterations in (0, 7, 17):  # of each session, committed at its end; then some more that are lost
+    for iterations in (0, 7, 38):  # of each session, committed at its end; then some more that are lost
         session = started(config, tmp_path / "broken")
         assert session.run(after(iterations)) == "interrupted"
         session.commit = lambda: None  # type: ignore[method-assign]
