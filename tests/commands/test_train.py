@@ -272,10 +272,11 @@ def test_a_sweep_runs_what_is_missing_and_tables_what_it_found(tiny: Compose, ti
 @pytest.mark.parametrize(
     "overrides",
     [
-        ("model=cnn", "env.num_envs=1", "phase.quick.steps=30_000"),
-        ("model=resnet", "env.size=16", "env.num_envs=8", "env.workers=2", "phase.quick.steps=30_000"),
+        ("model=cnn", "env.num_envs=1", "phase.quick.steps=10_000"),
+        ("model=resnet", "env.size=16", "env.num_envs=8", "env.workers=2", "phase.quick.steps=10_000"),
     ],
 )
+@pytest.mark.timeout(1_200)  # seconds
 def test_a_training_killed_twenty_times_is_the_unbroken_one(
     tiny: Compose, tiny_overrides: tuple[str, ...], tmp_path: Path, overrides: tuple[str, ...]
 ) -> None:
@@ -283,7 +284,7 @@ def test_a_training_killed_twenty_times_is_the_unbroken_one(
     config = tiny(*chosen)
     assert train_and_kill(config, (*tiny_overrides, *chosen), tmp_path / "unbroken", 0) == 0
     struck = train_and_kill(config, (*tiny_overrides, *chosen), tmp_path / "killed", 20)
-    assert struck >= 10
+    assert struck >= 5
     assert fingerprints(config, tmp_path / "unbroken") == fingerprints(config, tmp_path / "killed")
 
 
