@@ -205,7 +205,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     def run(title: str, programs: dict[str, Program]) -> dict[str, list[float]]:
         rates = contest(programs, args.rounds, args.seconds)
-        print_rates(title, "steps/s", rates)
+        if rates:
+            print_rates(title, "steps/s", rates)
         return rates
 
     left_out = missing("stable_baselines3")
