@@ -219,11 +219,20 @@ class TrackingConfig:
     """Where and how densely a run is recorded."""
 
     name: Literal["mlflow", "none"]
+    uri: str | None  # of an MLflow server; null: the outputs folder's own database
     experiment: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 _.-]{0,99}$")]
     every_steps: Count  # steps between two points of a curve
     histogram_episodes: Count  # episodes in a window's score histogram
     commit_episodes: Count  # episodes between two checkpoints
     commit_seconds: Positive  # seconds between two checkpoints at the most
+
+    def __post_init__(self) -> None:
+        # It is written into files, which is no place for a password.
+        if self.uri is not None and not re.fullmatch(r"https?://[^\s@?#]+", self.uri):
+            raise ConfigError(
+                "tracking.uri: should be null or a server's address, as in http://127.0.0.1:5000; user and password "
+                "belong into the environment, as MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD"
+            )
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)

@@ -66,6 +66,7 @@ def another(key: str, value: Any) -> Any:
         "resume": ("auto", "never"),
         "device": ("auto", "cpu"),
         "tracking.name": ("mlflow", "none"),
+        "tracking.uri": ("http://127.0.0.1:5000",),
         "budget.forecast": ("warn", "off"),
     }
     if key in special:
@@ -146,6 +147,15 @@ def test_the_order_of_phases_counts_and_their_names_do_not() -> None:
     identity = parse(Config, tree).identity()
     assert parse(Config, changed(tree, "phase", {"second": second, "first": first})).identity() != identity
     assert parse(Config, changed(tree, "phase", {"warm": first, "cold": second})).identity() == identity
+
+
+@pytest.mark.parametrize(
+    "uri", ["", "sqlite:///a.db", "127.0.0.1:5000", "http://me:secret@host", "http://h/?token=secret"]
+)
+def test_an_address_that_is_none_or_holds_a_password_is_refused_without_repeating_it(uri: str) -> None:
+    with pytest.raises(ConfigError, match=r"tracking\.uri: .*MLFLOW_TRACKING_USERNAME") as refused:
+        parse(Config, changed(TREES["cnn"], "tracking.uri", uri))
+    assert "secret" not in str(refused.value)
 
 
 def test_a_run_is_named_after_what_it_is() -> None:

@@ -9,10 +9,11 @@ from atlantis_exp.config import BaselineConfig, to_dict
 def baseline(config: BaselineConfig) -> None:
     """Play, print the report's table, and record it all."""
     from atlantis_exp.build import build_baseline, run_evaluation
-    from atlantis_exp.commands.runs import RunFolder, record_evaluation
+    from atlantis_exp.commands.runs import RunFolder, record_evaluation, settle
     from atlantis_exp.training.progress import Progress
 
     outputs = Path(config.paths.outputs)
+    settle(outputs)
     folder = RunFolder(outputs / "runs" / config.run_name())
     progress = Progress()
     progress.say(f"{config.agent.name} player, {config.evaluation.episodes} episodes of {config.env.id}")

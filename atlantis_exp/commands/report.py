@@ -25,18 +25,16 @@ def report(config: ReportConfig) -> None:
         column.justify = "right"
     for run in runs:
         result = run.result
-        if result is None or not result["evaluation"]:
-            table.add_row(run.name, run.state if result is None else f"{result['steps']:,}")
+        if result is None or not result.evaluation:
+            table.add_row(run.name, run.state if result is None else f"{result.steps:,}")
             continue
-        scores = {
-            key.split("/")[1]: value for key, value in result["evaluation"].items() if key.startswith("evaluation/")
-        }
+        scores = {key.split("/")[1]: value for key, value in result.evaluation.items() if key.startswith("evaluation/")}
         points = ("mean", "standard_error", "median", "interquartile_mean", "high", "low")
         table.add_row(
             run.name,
-            f"{result['steps']:,}",
+            f"{result.steps:,}",
             *(f"{scores[point]:,.0f}" for point in points),
-            f"{result['evaluation']['actions/random_share']:.1%}",
+            f"{result.evaluation['actions/random_share']:.1%}",
             f"{scores['episodes']:.0f}",
         )
     console = Console(highlight=False)
@@ -44,7 +42,7 @@ def report(config: ReportConfig) -> None:
     console.print(table)
     for run in runs:
         if run.result is not None:
-            console.print(f"\n{run.name}\n{run.result['report']}", markup=False)
+            console.print(f"\n{run.name}\n{run.result.report}", markup=False)
     console.print(f"\nthe MLflow UI: make ui (python -m atlantis_exp ui paths.outputs={outputs})", markup=False)
 
 

@@ -8,16 +8,18 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, TextIO, get_args
+from typing import Any, Literal, TextIO, TypeVar, get_args
+
+from pydantic import TypeAdapter, ValidationError
 
 from atlantis_exp.config import ConfigError, TrackingConfig, flatten, nearest
 from atlantis_exp.faults import Fault
 from atlantis_exp.media import score_histogram
-from atlantis_exp.tracking.journal import Journal, read_commit, write_file
-from atlantis_exp.tracking.store import Publisher, Store
+from atlantis_exp.tracking.journal import Journal, JournalError, Status, read_commit, write_file
+from atlantis_exp.tracking.store import Publisher, Store, unfinished
 from atlantis_exp.training.evaluation import Evaluation
 
 _DRAIN_SECONDS = 20.0  # that a command waits for MLflow at its end; `settle` sends what is missing then
@@ -25,11 +27,26 @@ _HOLD_SECONDS = 2.0  # that a command waits for a run, which `settle` may hold f
 _LIBRARIES = ("atlantis-exp", "ale-py", "gymnasium", "torch", "numpy", "opencv-python-headless", "hydra-core", "mlflow")
 
 State = Literal["done", "running", "failed", "interrupted", "missing"]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a run ended: the numbers of its last evaluation and the report's table of them."""
+
+    outcome: str
+    steps: int
+    counts: dict[str, float]  # episodes, frames, updates and hours of a training
+    evaluation: dict[str, float]
+    report: str
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """One run's folder: `config.json` at its start, `result.json` at its end, journal and checkpoints in between."""
+    """One run's folder: `config.json` at its start, `result.json` at its end, journal and checkpoints in between.
+
+    Reading a file of it that is damaged raises Fault.
+    """
 
     path: Path
 
@@ -39,26 +56,39 @@ class RunFolder:
         return self.path.name
 
     @property
-    def config(self) -> dict[str, Any] | None:
-        """The composed config, None before the run's start."""
-        return _read_json(self.path / "config.json")
+    def has_started(self) -> bool:
+        """Whether there is anything to continue."""
+        return (self.path / "config.json").exists()
 
     @property
-    def result(self) -> dict[str, Any] | None:
+    def config(self) -> dict[str, Any]:
+        """The composed config, empty before the run's start."""
+        return _read(self.path / "config.json", dict[str, Any]) or {}
+
+    @property
+    def result(self) -> Result | None:
         """How the run ended, None before its end."""
-        return _read_json(self.path / "result.json")
+        return _read(self.path / "result.json", Result)
+
+    @property
+    def status(self) -> Status | None:
+        """What the run last said of itself, None before it said anything."""
+        try:
+            commit = read_commit(self.path)
+        except JournalError as error:
+            raise Fault(str(error)) from None
+        return commit.status if commit else None
 
     @property
     def state(self) -> State:
         """How the run stands; one whose process was killed is interrupted, whatever its journal says."""
+        if not self.has_started:
+            return "missing"
         if self.result is not None:
             return "done"
-        if self.config is None:
-            return "missing"
-        commit = read_commit(self.path)
-        if commit is not None and commit.status == "FAILED":
+        if self.status == "FAILED":
             return "failed"
-        return "running" if commit is not None and commit.status == "RUNNING" and self._is_held() else "interrupted"
+        return "running" if self.status == "RUNNING" and self._is_held() else "interrupted"
 
     def _is_held(self) -> bool:
         path = self.path / "lock"
@@ -71,9 +101,9 @@ class RunFolder:
         """Keep the composed config."""
         write_file(self.path / "config.json", json.dumps(config, indent=2).encode())
 
-    def write_result(self, result: Mapping[str, Any]) -> None:
+    def write_result(self, result: Result) -> None:
         """Keep how the run ended."""
-        write_file(self.path / "result.json", json.dumps(result, indent=2).encode())
+        write_file(self.path / "result.json", json.dumps(asdict(result), indent=2).encode())
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -94,23 +124,22 @@ class RunFolder:
 
 def settle(outputs: Path) -> None:
     """Say of runs whose process was killed that they are interrupted, and send MLflow what a command had to leave."""
+    unreachable: set[str] = set()
     for path in sorted((outputs / "runs").glob("*/commit.json")):
-        folder, commit = RunFolder(path.parent), read_commit(path.parent)
-        if commit is not None and commit.status == "RUNNING" and not folder._is_held():
-            with suppress(Fault), folder.held():
-                Journal(folder.path).status("KILLED")
-                print(f"run {folder.name} was killed; the command that started it continues it")
-        mirrored = _read_json(folder.path / "published.json")
-        commit = read_commit(folder.path)
-        if mirrored is None or commit is None or commit.status == "RUNNING":
+        folder = RunFolder(path.parent)
+        try:
+            if folder.status == "RUNNING" and not folder._is_held():
+                with suppress(Fault), folder.held():
+                    Journal(folder.path).status("KILLED")
+                    print(f"run {folder.name} was killed; the command that started it continues it")
+            store = None if folder.status == "RUNNING" else unfinished(folder.path, outputs)
+        except Fault as fault:
+            print(f"atlantis_exp: {fault}", file=sys.stderr)  # no reason to refuse a command for another run
             continue
-        if (mirrored["identity"], mirrored["offset"], mirrored["status"]) != (
-            commit.identity,
-            commit.offset,
-            commit.status,
-        ):
-            publisher = Publisher(folder.path, Store(outputs, mirrored["store"].rpartition("#")[2]))
-            publisher.drain(_DRAIN_SECONDS)
+        if store is None or store.address in unreachable:
+            continue
+        if not Publisher(folder.path, store).drain(_DRAIN_SECONDS):
+            unreachable.add(store.address)
 
 
 @contextmanager
@@ -133,7 +162,7 @@ def _print_table(folders: Sequence[RunFolder]) -> None:
 
 def find_run(outputs: Path, name: str) -> RunFolder:
     """The training run of that name, that start of a name, or the latest. Raises: ConfigError."""
-    folders = [folder for folder in all_runs(outputs) if "model" in (folder.config or {})]
+    folders = [folder for folder in all_runs(outputs) if "model" in folder.config]
     if not folders:
         raise ConfigError(f"run={name}: there is no training run under {outputs / 'runs'}")
     if name == "latest":
@@ -171,13 +200,16 @@ def provenance() -> dict[str, str]:
 
 
 @contextmanager
-def published(folder: RunFolder, tracking: str, outputs: Path, experiment: str) -> Iterator[Journal]:
-    """A journal in the run's folder that is mirrored to the local MLflow store while it grows (tracking=mlflow)."""
-    journal = Journal(folder.path)
-    if tracking == "none":
+def published(folder: RunFolder, tracking: TrackingConfig, outputs: Path) -> Iterator[Journal]:
+    """A journal in the run's folder that is mirrored to MLflow while it grows (tracking=mlflow). Raises: Fault."""
+    try:
+        journal = Journal(folder.path)
+    except JournalError as error:
+        raise Fault(str(error)) from None
+    if tracking.name == "none":
         yield journal
         return
-    publisher = Publisher(folder.path, Store(outputs, experiment))
+    publisher = Publisher(folder.path, Store(outputs, tracking.experiment, tracking.uri))
     try:
         yield journal
     finally:
@@ -198,7 +230,7 @@ def record_evaluation(
 ) -> None:
     """Print an evaluation as the report does, and keep it as a run of its own; `facts` are its params."""
     print(f"\n{evaluation.report()}\n")
-    with folder.held(), published(folder, tracking.name, outputs, tracking.experiment) as journal:
+    with folder.held(), published(folder, tracking, outputs) as journal:
         folder.write_config(facts)
         journal.params({key: str(value) for key, value in flatten(facts).items()})
         journal.tags({**provenance(), "atlantis.kind": kind})
@@ -215,14 +247,7 @@ def record_evaluation(
         journal.state_dict()
         journal.commit()
         journal.status("FINISHED")
-        folder.write_result(
-            {
-                "outcome": "finished",
-                "steps": step,
-                "evaluation": evaluation.metrics(),
-                "report": evaluation.report(),
-            }
-        )
+        folder.write_result(Result("finished", step, {}, evaluation.metrics(), evaluation.report()))
     print(f"recorded as {folder.name} in {folder.path}")
 
 
@@ -235,8 +260,8 @@ def _locked(file: TextIO) -> bool:
     return True
 
 
-def _read_json(path: Path) -> dict[str, Any] | None:
-    if not path.exists():
-        return None
-    content: dict[str, Any] = json.loads(path.read_text())
-    return content
+def _read(path: Path, schema: type[T]) -> T | None:
+    try:
+        return TypeAdapter(schema).validate_json(path.read_bytes(), strict=True) if path.exists() else None
+    except ValidationError:
+        raise Fault(f"{path} is damaged: remove it and issue the run's command again, which writes it anew") from None

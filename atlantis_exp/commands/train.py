@@ -19,6 +19,7 @@ from atlantis_exp.faults import Fault
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from atlantis_exp.commands.runs import Result, RunFolder
     from atlantis_exp.training.progress import Progress
     from atlantis_exp.training.trainer import Trainer
 
@@ -79,32 +80,32 @@ def train(config: Config) -> None:
     outputs = Path(config.paths.outputs)
     settle(outputs)
     folder = RunFolder(outputs / "runs" / config.run_name())
-    if config.resume == "must" and folder.config is None:
+    if config.resume == "must" and not folder.has_started:
         raise ConfigError(f"resume=must: there is no run {folder.name} under {outputs / 'runs'}")
-    if config.resume == "never" and folder.config is not None:
+    if config.resume == "never" and folder.has_started:
         kept = next(
             path for n in range(1, 10_000) if not (path := folder.path.with_name(f"{folder.name}~{n}")).exists()
         )
         with folder.held():
             folder.path.rename(kept)
         print(f"the run that was here is kept as {kept}")
-    if (result := folder.result) is not None and not _goes_on(config, result):
-        print(f"run {folder.name} has ended ({result['outcome']} after {result['steps']:,} steps):\n")
-        print(result["report"])
+    if folder.has_started and (result := folder.result) is not None and not _goes_on(config, result):
+        print(f"run {folder.name} has ended ({result.outcome} after {result.steps:,} steps):\n")
+        print(result.report)
         return
     with folder.held():
         _train(config, folder)
 
 
-def _goes_on(config: Config, result: dict[str, Any]) -> bool:
+def _goes_on(config: Config, result: "Result") -> bool:
     """Whether a run that ended by its budget has now a larger one."""
     budget = config.budget.steps
-    return result["outcome"] == "budget" and (budget is None or budget > result["steps"])
+    return result.outcome == "budget" and (budget is None or budget > result.steps)
 
 
-def _train(config: Config, folder: Any) -> None:
+def _train(config: Config, folder: "RunFolder") -> None:
     from atlantis_exp.build import build_trainer
-    from atlantis_exp.commands.runs import provenance, published
+    from atlantis_exp.commands.runs import Result, provenance, published
     from atlantis_exp.game.vector import WorkerDied
     from atlantis_exp.tracking.journal import JournalError
     from atlantis_exp.training.checkpoint import CheckpointError
@@ -115,15 +116,15 @@ def _train(config: Config, folder: Any) -> None:
     outputs = Path(config.paths.outputs)
     command = shlex.join(["python", "-m", "atlantis_exp", *sys.argv[1:]])
     stop = StopRequest(config.budget.seconds)
-    with stop.installed(), published(folder, config.tracking.name, outputs, config.tracking.experiment) as journal:
+    with stop.installed(), published(folder, config.tracking, outputs) as journal:
         trainer = build_trainer(config, folder.path, journal, progress)
         try:
             state = trainer.checkpoints.load(trainer.memory, progress.say)
+            folder.write_config(to_dict(config))
             if state is not None:
                 trainer.load_state_dict(state)
                 progress.say(f"continuing run {folder.name} at step {trainer.counters.steps:,}")
             else:
-                folder.write_config(to_dict(config))
                 journal.params({key: str(value) for key, value in flatten(to_dict(config)).items()})
                 journal.artifact("config.json", (folder.path / "config.json").read_bytes())
                 progress.say(f"starting run {folder.name} in {folder.path}")
@@ -148,18 +149,13 @@ def _train(config: Config, folder: Any) -> None:
     if outcome == "interrupted":
         stop.leave(f"run {folder.name} is committed at step {trainer.counters.steps:,}; continue with: {command}")
     report = trainer.last_report or "no evaluation (evaluation.at_end=false)"
-    folder.write_result(
-        {
-            "outcome": outcome,
-            "steps": trainer.counters.steps,
-            "episodes": trainer.counters.episodes,
-            "frames": trainer.counters.frames,
-            "updates": trainer.learner.updates,
-            "hours": trainer.counters.seconds / 3600,
-            "evaluation": trainer.last_metrics,
-            "report": report,
-        }
-    )
+    counts = {
+        "episodes": trainer.counters.episodes,
+        "frames": trainer.counters.frames,
+        "updates": trainer.learner.updates,
+        "hours": trainer.counters.seconds / 3600,
+    }
+    folder.write_result(Result(outcome, trainer.counters.steps, counts, trainer.last_metrics, report))
     print(f"\n{report}\n\nrun {folder.name}: {trainer.counters.steps:,} steps, {trainer.counters.seconds:,.0f} s")
 
 

@@ -35,7 +35,7 @@ def verify_resume(config: Config) -> None:
         unbroken, killed = fingerprints(config, folder.path / "unbroken"), fingerprints(config, folder.path / "killed")
         differing = sorted(part for part in unbroken if unbroken[part] != killed[part])
         verdict = f"differs in {', '.join(differing)}" if differing else "is the unbroken one, bit for bit"
-        with published(folder, config.tracking.name, outputs, config.tracking.experiment) as journal:
+        with published(folder, config.tracking, outputs) as journal:
             journal.params({key: str(value) for key, value in flatten(to_dict(config)).items()})
             journal.tags({**provenance(), "atlantis.kind": "verification", "verdict": verdict})
             journal.metrics({"verification/equal": not differing, "verification/kills": kills}, 0)

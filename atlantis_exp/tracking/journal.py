@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, get_args
 from uuid import uuid4
 
+from pydantic import TypeAdapter, ValidationError
+
 Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
 
 
@@ -93,6 +95,9 @@ class JournalError(ValueError):
     """A journal that cannot be continued from."""
 
 
+_COMMIT = TypeAdapter(Commit)
+
+
 class Tracker(Protocol):
     """What training may tell about itself."""
 
@@ -151,6 +156,7 @@ class Journal:
     tags, images and models are checked against MLflow's alphabet, so that publishing cannot stumble over them later.
 
     Raises:
+        JournalError: on a folder whose `commit.json` is damaged.
         ValueError: on a name that MLflow would refuse, or a path that leads out of `artifacts/`.
         OSError: from `state_dict` when the disk refuses; what was durable stays so, and a later call writes the rest.
     """
@@ -229,9 +235,16 @@ class Journal:
 
 
 def read_commit(folder: Path) -> Commit | None:
-    """Returns what the run folder's writer last committed, None before its first commit or status."""
+    """Returns what the run folder's writer last committed, None before its first commit or status.
+
+    Raises:
+        JournalError: on a file that no writer left so; without it the whole journal is a new run to its readers.
+    """
     path = folder / "commit.json"
-    return Commit(**json.loads(path.read_bytes())) if path.exists() else None
+    try:
+        return _COMMIT.validate_json(path.read_bytes(), strict=True) if path.exists() else None
+    except ValidationError:
+        raise JournalError(f"{path} is damaged: remove it and issue the run's command again") from None
 
 
 def read(folder: Path, start: int = 0, end: int | None = None) -> Iterator[tuple[int, Record]]:

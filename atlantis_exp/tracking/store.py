@@ -20,6 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from uuid import UUID, uuid5
 
+from pydantic import TypeAdapter, ValidationError
+
 from atlantis_exp.tracking.journal import (
     Artifact,
     Commit,
@@ -143,6 +145,17 @@ class Store:
             return client, client.create_experiment(self._experiment, location)
 
 
+def unfinished(folder: Path, root: Path) -> Store | None:
+    """Returns the store, with its files under `root`, that lacks a part of what a published folder has committed."""
+    cursor, commit = _Cursor.read(folder), read_commit(folder)
+    if cursor is None or commit is None:
+        return None
+    if (cursor.identity, cursor.offset, cursor.status) == (commit.identity, commit.offset, commit.status):
+        return None
+    uri, _, experiment = cursor.store.rpartition("#")
+    return Store(root, experiment, uri if uri.startswith("http") else None)
+
+
 class Publisher:
     """A thread that keeps MLflow up to date with a run folder's commits and never disturbs the run.
 
@@ -239,9 +252,7 @@ class _Cursor:
     @classmethod
     def of(cls, folder: Path, store: Store, commit: Commit) -> "_Cursor":
         """Returns the folder's cursor in this store, at the start of a found or new run if there is none."""
-        path = folder / "published.json"
-        if path.exists():
-            cursor = cls(**json.loads(path.read_bytes()))
+        if (cursor := cls.read(folder)) is not None:
             if (cursor.store, cursor.identity) == (store.address, commit.identity):
                 return cursor
             if cursor.store == store.address:
@@ -249,6 +260,14 @@ class _Cursor:
         cursor = cls(store.address, commit.identity, store.open_run(folder, commit))
         cursor.save(folder)
         return cursor
+
+    @classmethod
+    def read(cls, folder: Path) -> "_Cursor | None":
+        """Returns what was noted in a folder; None also where that is damaged, since sending all again is harmless."""
+        try:
+            return TypeAdapter(cls).validate_json((folder / "published.json").read_bytes(), strict=True)
+        except (FileNotFoundError, ValidationError):
+            return None
 
     def save(self, folder: Path) -> None:
         write_file(folder / "published.json", json.dumps(asdict(self)).encode())

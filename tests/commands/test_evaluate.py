@@ -49,6 +49,18 @@ def test_no_run_at_all_is_one_line_and_nothing_is_created(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("damaged", ["", "{", "[]", '{"model": {}}', '{"model": {"_target_": "os.system"}}'])
+def test_a_damaged_config_is_one_line_that_names_its_file(
+    outputs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], damaged: str
+) -> None:
+    path = outputs / "runs/cnn-uniform-s0-aa/config.json"
+    path.write_text(damaged)
+    assert run(monkeypatch, "run=cnn-uniform-s0-aa", f"paths.outputs={outputs}") in (1, 2)
+    error = capsys.readouterr().err
+    assert error.startswith(f"atlantis_exp: {path}")
+    assert error.count("\n") == 1
+
+
 @pytest.mark.parametrize("name", ["epsilon", "episodes"])
 def test_epsilon_and_episodes_are_the_evaluations(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str

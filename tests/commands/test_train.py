@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import os
 import signal
@@ -5,7 +6,7 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,15 @@ import pytest
 from atlantis_exp.commands.runs import RunFolder, settle
 from atlantis_exp.commands.train import StopRequest, train
 from atlantis_exp.commands.verify_resume import fingerprints, train_and_kill
-from atlantis_exp.config import Config, ConfigError
+from atlantis_exp.config import Config, ConfigError, to_dict
 from atlantis_exp.faults import Fault
 from atlantis_exp.tracking.journal import Metrics, read, read_commit
+from atlantis_exp.training.checkpoint import Checkpoints
 
 Compose = Callable[..., Config]
 REPOSITORY = Path(__file__).parents[2]
 COMMAND = (sys.executable, "-m", "atlantis_exp")
+SHORT = ("phase.quick.steps=40", "evaluation.at_end=false", "evaluation.every_steps=null")
 LONG = ("phase.quick.steps=100_000", "evaluation.every_steps=null", "tracking.commit_seconds=0.2")
 
 
@@ -72,18 +75,62 @@ def test_a_larger_budget_continues_a_run_that_its_budget_ended(tiny: Compose) ->
         train(config)
     result = run_of(config).result
     assert result is not None
-    assert (result["outcome"], result["steps"]) == ("finished", 160)
+    assert (result.outcome, result.steps) == ("finished", 160)
     unbroken = tiny("evaluation.at_end=false", "evaluation.every_steps=null", f"paths.outputs={config.paths.outputs}/u")
     train(unbroken)
     assert fingerprints(config, Path(config.paths.outputs)) == fingerprints(unbroken, Path(unbroken.paths.outputs))
 
 
+@pytest.mark.parametrize(
+    ("name", "damaged"),
+    [
+        ("result.json", ""),
+        ("result.json", "[1]"),
+        ("result.json", '{"outcome": "finished", "steps": "many", "counts": {}, "evaluation": {}, "report": ""}'),
+        ("commit.json", '{"identity": "a", "started": 1, "updated": 1, "offset": 0'),
+        ("commit.json", '{"identity": "a", "started": 1, "updated": 1, "offset": "0", "status": "RUNNING"}'),
+    ],
+)
+def test_a_damaged_file_of_a_run_is_one_clear_line_and_is_written_anew_once_it_is_removed(
+    tiny: Compose, name: str, damaged: str
+) -> None:
+    config = tiny(*SHORT, "budget.steps=20")
+    train(config)
+    folder = run_of(config)
+    path = folder.path / name
+    whole = json.loads(path.read_bytes())
+    path.write_text(damaged)
+    with pytest.raises(Fault, match=f"{path} is damaged: remove it and issue the run's command again"):
+        train(tiny(*SHORT))
+    path.unlink()
+    train(tiny(*SHORT))
+    assert json.loads(path.read_bytes()).keys() == whole.keys()
+    assert folder.state == "done"
+
+
+def test_a_damaged_run_is_no_obstacle_to_another(tiny: Compose, capsys: pytest.CaptureFixture[str]) -> None:
+    damaged = tiny(*SHORT).paths.outputs + "/runs/damaged/commit.json"
+    Path(damaged).parent.mkdir(parents=True)
+    Path(damaged).write_text("{")
+    train(tiny(*SHORT))
+    assert capsys.readouterr().err.startswith(f"atlantis_exp: {damaged} is damaged")
+
+
+def test_a_config_that_was_lost_is_written_again(tiny: Compose) -> None:
+    config = tiny(*SHORT)
+    train(config)
+    (run_of(config).path / "config.json").unlink()
+    assert str(run_of(config).state) == "missing"
+    train(config)
+    assert run_of(config).config == to_dict(config)
+    assert run_of(config).state == "done"
+
+
 def test_resume_must_refuses_to_start_and_resume_never_keeps_what_was_there(tiny: Compose) -> None:
-    short = ("phase.quick.steps=40", "evaluation.at_end=false", "evaluation.every_steps=null")
     with pytest.raises(ConfigError, match="resume=must: there is no run"):
-        train(tiny(*short, "resume=must"))
+        train(tiny(*SHORT, "resume=must"))
     for resume in ("auto", "must", "never"):
-        config = tiny(*short, f"resume={resume}")
+        config = tiny(*SHORT, f"resume={resume}")
         train(config)
     names = sorted(path.name for path in run_of(config).path.parent.iterdir())
     assert names == [config.run_name(), f"{config.run_name()}~1"]
@@ -165,10 +212,44 @@ def test_under_slurm_sigterm_is_a_warning_and_sigusr2_goes_on_to_the_handler_bef
         signal.signal(signal.SIGUSR2, before)
 
 
-def test_a_disk_without_space_is_one_clear_line_and_costs_nothing_committed(
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 64 MiB, where mounting one is allowed."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ("mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", str(disk))
+    if (refused := subprocess.run(mount, capture_output=True, text=True, check=False)).returncode:
+        pytest.skip(f"may not mount a file system: {refused.stderr.strip()}")
+    yield disk
+    subprocess.run(("umount", str(disk)), check=True)
+
+
+def test_a_full_disk_is_one_clear_line_and_costs_nothing_committed(tiny: Compose, small_disk: Path) -> None:
+    chosen = (*SHORT, "phase.quick.steps=100", "tracking.commit_seconds=1e-9")
+    config = tiny(*chosen, f"paths.outputs={small_disk}")
+    folder, ballast = run_of(config), small_disk / "ballast"
+    train(dataclasses.replace(config, budget=dataclasses.replace(config.budget, steps=50)))
+    for space in (0, 4, 8, 64):  # KiB: no config, no replay segment, no state, no tensors
+        filesystem = os.statvfs(small_disk)
+        ballast.write_bytes(bytes(max(filesystem.f_bavail * filesystem.f_frsize - space * 1024, 0)))
+        with pytest.raises((Fault, OSError), match="No space left on device") as fault:
+            train(config)
+        assert "\n" not in str(fault.value)
+        ballast.unlink()
+        state = Checkpoints(folder.path / "checkpoints", config.identity()).load(warn=pytest.fail)
+        assert state is not None
+        assert state["counters"]["steps"] == 50
+    train(config)
+    assert folder.state == "done"
+    unbroken = tiny(*chosen)
+    train(unbroken)
+    assert fingerprints(config, small_disk) == fingerprints(unbroken, Path(unbroken.paths.outputs))
+
+
+def test_a_commit_that_the_disk_refuses_is_one_clear_line_and_costs_nothing_committed(
     tiny: Compose, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = tiny("tracking.commit_seconds=1e-9", "evaluation.every_steps=null")
+    config = tiny(*SHORT, "tracking.commit_seconds=1e-9")
     synced, calls = os.fsync, iter(range(100))
 
     def full(file: int) -> None:
@@ -183,7 +264,7 @@ def test_a_disk_without_space_is_one_clear_line_and_costs_nothing_committed(
     folder = run_of(config)
     assert folder.state == "interrupted"
     train(config)
-    unbroken = tiny("evaluation.every_steps=null", f"paths.outputs={config.paths.outputs}/unbroken")
+    unbroken = tiny(*SHORT, f"paths.outputs={config.paths.outputs}/unbroken")
     train(unbroken)
     assert fingerprints(config, Path(config.paths.outputs)) == fingerprints(unbroken, Path(unbroken.paths.outputs))
 
@@ -256,11 +337,10 @@ def test_a_killed_run_is_shown_as_interrupted_then_continued_and_sigterm_ends_it
 
 
 def test_a_sweep_runs_what_is_missing_and_tables_what_it_found(tiny: Compose, tiny_overrides: tuple[str, ...]) -> None:
-    short = ("phase.quick.steps=40", "evaluation.at_end=false", "evaluation.every_steps=null")
-    config = tiny(*short)
+    config = tiny(*SHORT)
     train(config)
-    missing = tiny(*short, "seed=1")
-    done, error = session(config, tiny_overrides, *short, "seed=0,1", "-m").communicate()
+    missing = tiny(*SHORT, "seed=1")
+    done, error = session(config, tiny_overrides, *SHORT, "seed=0,1", "-m").communicate()
     assert error == ""
     tables = [line for line in done.splitlines() if line.startswith("sweep of 2 runs")]
     assert tables == ["sweep of 2 runs: 1 done, 1 missing", "sweep of 2 runs: 2 done"]
