@@ -56,7 +56,7 @@ def mp4() -> bytes:
 
 
 def test_a_film_holds_every_screen_as_h264_that_browsers_play(mp4: bytes) -> None:
-    with av.open(io.BytesIO(mp4)) as container:
+    with av.open(io.BytesIO(mp4), "r") as container:
         stream = container.streams.video[0]
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
