@@ -2,14 +2,16 @@ import dataclasses
 import json
 import os
 import signal
+import socket
 import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
 import pytest
 
@@ -18,7 +20,8 @@ from atlantis_exp.commands.train import StopRequest, train
 from atlantis_exp.commands.verify_resume import fingerprints, train_and_kill
 from atlantis_exp.config import Config, ConfigError, to_dict
 from atlantis_exp.faults import Fault
-from atlantis_exp.tracking.journal import Metrics, read, read_commit
+from atlantis_exp.tracking.journal import Artifact, Image, Metrics, Model, read, read_commit
+from atlantis_exp.tracking.store import Store, publish
 from atlantis_exp.training.checkpoint import Checkpoints
 
 Compose = Callable[..., Config]
@@ -287,6 +290,16 @@ def points(outputs: Path, name: str) -> list[tuple[Any, ...]]:
         ).fetchall()
 
 
+def journaled(folder: Path) -> list[tuple[Any, ...]]:
+    found = [
+        (key, record.step, record.time, value)
+        for _, record in read(folder)
+        if isinstance(record, Metrics)
+        for key, value in record.values.items()
+    ]
+    return sorted(found, key=lambda point: (point[0], point[2], point[1]))
+
+
 def test_a_killed_run_is_shown_as_interrupted_then_continued_and_sigterm_ends_it_with_143(
     tiny: Compose, tiny_overrides: tuple[str, ...]
 ) -> None:
@@ -322,18 +335,91 @@ def test_a_killed_run_is_shown_as_interrupted_then_continued_and_sigterm_ends_it
     commit = read_commit(folder.path)
     assert commit is not None
     assert commit.status == "KILLED"
-    journaled = [
-        (key, record.step, record.time, value)
-        for _, record in read(folder.path)
-        if isinstance(record, Metrics)
-        for key, value in record.values.items()
-    ]
-    assert points(outputs, folder.name) == sorted(journaled, key=lambda point: (point[0], point[2], point[1]))
-    assert len({(key, step) for key, step, _, _ in journaled if key == "actions/epsilon"}) == len(
-        [key for key, _, _, _ in journaled if key == "actions/epsilon"]
-    )
+    assert points(outputs, folder.name) == journaled(folder.path)
+    steps = [step for key, step, *_ in journaled(folder.path) if key == "actions/epsilon"]
+    assert steps == sorted(set(steps))
     with closing(sqlite3.connect(outputs / "mlflow.db")) as database:
         assert database.execute("SELECT count(*) FROM runs").fetchall() == [(1,)]
+
+
+@contextmanager
+def mlflow_server(folder: Path, port: int) -> Iterator[None]:
+    """A server on the store in a folder, which ends by SIGKILL."""
+    store = ("--backend-store-uri", f"sqlite:///{folder}/mlflow.db", "--artifacts-destination", f"{folder}/artifacts")
+    process = subprocess.Popen(
+        (sys.executable, "-m", "mlflow", "server", "--port", str(port), "--workers", "1", *store),
+        env={**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,  # it has a process that serves
+    )
+
+    def answers() -> bool:
+        try:
+            return bool(urlopen(f"http://127.0.0.1:{port}/health", timeout=5).status == 200)
+        except OSError:
+            return False
+
+    try:
+        wait_for(answers)
+        yield
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+@pytest.mark.slow
+def test_a_server_that_is_gone_for_a_while_has_everything_once_it_is_back(
+    tiny: Compose, tiny_overrides: tuple[str, ...], tmp_path: Path
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    server = tmp_path / "server"
+    server.mkdir()
+    chosen = (
+        *("tracking=mlflow", f"tracking.uri=http://127.0.0.1:{port}", "tracking.every_steps=200", *LONG),
+        *("evaluation.every_steps=1_000", "tracking.histogram_episodes=50"),
+    )
+    config = tiny(*chosen)
+    folder = run_of(config).path
+
+    def published() -> int:
+        file = folder / "published.json"
+        return int(json.loads(file.read_bytes())["offset"]) if file.exists() else 0
+
+    def evaluations() -> int:
+        return len(list(folder.glob("artifacts/evaluation/*.csv")))
+
+    with mlflow_server(server, port):
+        training = session(config, tiny_overrides, *chosen)
+        wait_for(lambda: published() > 0)
+    before, evaluated = published(), evaluations()
+    time.sleep(6.0)  # seconds; the publisher looks every 5
+    wait_for(lambda: evaluations() >= evaluated + 3)
+    assert published() == before
+    with mlflow_server(server, port):
+        training.send_signal(signal.SIGTERM)
+        out, error = training.communicate()
+        assert training.returncode == 143
+        assert (out + error).count("Publishing to MLflow fails") == 1
+        publish(folder, Store(tmp_path, tracking_uri=config.tracking.uri))  # what the command did not wait for
+
+    records = [record for _, record in read(folder)]
+    assert points(server, folder.name) == journaled(folder)
+    runs = list((server / "artifacts").glob("*/*/artifacts/config.json"))
+    assert len(runs) == 1
+    images = [record for record in records if isinstance(record, Image)]
+    shown = [path.name for path in (runs[0].parent / "images").iterdir()]
+    assert len(images) >= 3
+    for record in images:
+        name = f"{record.key.replace('/', '~')}+step+{record.step}+timestamp+{record.time}+"
+        assert len([file for file in shown if file.startswith(name)]) == 2  # one and its thumbnail
+    assert len(shown) == 2 * len(images)
+    for artifact in {record.path for record in records if isinstance(record, Artifact)}:
+        assert (runs[0].parent / artifact).read_bytes() == (folder / "artifacts" / artifact).read_bytes()
+    models = [folder / "artifacts" / record.path for record in records if isinstance(record, Model)]
+    stored = [path.read_bytes() for path in (server / "artifacts").glob("*/models/*/artifacts/*")]
+    assert sorted(stored) == sorted(path.read_bytes() for path in models)
 
 
 def test_a_sweep_runs_what_is_missing_and_tables_what_it_found(tiny: Compose, tiny_overrides: tuple[str, ...]) -> None:
