@@ -24,7 +24,7 @@ def verify_resume(config: Config) -> None:
 
     outputs = Path(config.paths.outputs)
     folder = RunFolder(outputs / "verifications" / config.run_name())
-    overrides = list(HydraConfig.get().overrides.task)
+    overrides = [*HydraConfig.get().overrides.task, "tracking=none"]
     with folder.held():
         for name in ("unbroken", "killed"):
             shutil.rmtree(folder.path / name, ignore_errors=True)
@@ -58,7 +58,7 @@ def train_and_kill(config: Config, overrides: Sequence[str], outputs: Path, kill
         Fault: a session ended with an error.
     """
     # When commits happen changes nothing, and without one there is nothing to continue from.
-    own = (f"paths.outputs={outputs}", "tracking=none", "tracking.commit_seconds=1.0", "resume=auto")
+    own = (f"paths.outputs={outputs}", "tracking.commit_seconds=1.0", "resume=auto")
     command = (sys.executable, "-m", "atlantis_exp", "train", *overrides, *own)
     folder = outputs / "runs" / config.run_name()
     struck = 0

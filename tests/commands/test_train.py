@@ -20,7 +20,7 @@ from atlantis_exp.commands.train import StopRequest, train
 from atlantis_exp.commands.verify_resume import fingerprints, train_and_kill
 from atlantis_exp.config import Config, ConfigError, to_dict
 from atlantis_exp.faults import Fault
-from atlantis_exp.tracking.journal import Artifact, Image, Metrics, Model, read, read_commit
+from atlantis_exp.tracking.journal import Artifact, Image, Journal, Metrics, Model, read
 from atlantis_exp.tracking.store import Store, publish
 from atlantis_exp.training.checkpoint import Checkpoints
 
@@ -47,8 +47,8 @@ def session(config: Config, tiny_overrides: tuple[str, ...], *overrides: str, **
     )
 
 
-def committed(folder: RunFolder) -> bool:
-    return any((folder.path / "checkpoints").glob("0*/manifest.json"))
+def generation(folder: RunFolder) -> int:
+    return max((int(path.parent.name) for path in folder.path.glob("checkpoints/0*/manifest.json")), default=0)
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
@@ -303,43 +303,45 @@ def journaled(folder: Path) -> list[tuple[Any, ...]]:
 def test_a_killed_run_is_shown_as_interrupted_then_continued_and_sigterm_ends_it_with_143(
     tiny: Compose, tiny_overrides: tuple[str, ...]
 ) -> None:
-    """With MLflow: one run, whose points are those of the journal, each once."""
-    chosen = ("tracking=mlflow", "tracking.every_steps=20", *LONG)
-    config = tiny(*chosen)
-    folder, outputs = run_of(config), Path(config.paths.outputs)
-
-    killed = session(config, tiny_overrides, *chosen)
-    wait_for(lambda: committed(folder) and (folder.path / "published.json").exists())
+    folder = run_of(tiny(*LONG))
+    killed = session(tiny(*LONG), tiny_overrides, *LONG)
+    wait_for(lambda: generation(folder) > 0)
     assert str(folder.state) == "running"
     with pytest.raises(Fault, match=f"is held by process {killed.pid} on"), folder.held():
         pass
     killed.kill()
     killed.wait()
     assert folder.state == "interrupted"
-    settle(outputs)
-    with closing(sqlite3.connect(outputs / "mlflow.db")) as database:
-        rows = database.execute(
-            "SELECT status, value FROM runs JOIN tags USING (run_uuid) WHERE key = 'resumable'"
-        ).fetchall()
-    assert rows == [("KILLED", "true")]
 
-    generations = max(path.parent.name for path in folder.path.glob("checkpoints/0*/manifest.json"))
-    ended = session(config, tiny_overrides, *chosen)
-    wait_for(lambda: max(path.parent.name for path in folder.path.glob("checkpoints/0*/manifest.json")) > generations)
+    before = generation(folder)
+    ended = session(tiny(*LONG), tiny_overrides, *LONG)
+    wait_for(lambda: generation(folder) > before)
     ended.send_signal(signal.SIGTERM)
     out, error = ended.communicate()
     assert ended.returncode == 143
+    assert f"run {folder.name} was killed; the command that started it continues it" in out
     assert f"continuing run {folder.name} at step" in out
     assert error.startswith(f"atlantis_exp: SIGTERM: run {folder.name} is committed at step")
     assert "continue with: python -m atlantis_exp experiment=quick" in error
-    commit = read_commit(folder.path)
-    assert commit is not None
-    assert commit.status == "KILLED"
-    assert points(outputs, folder.name) == journaled(folder.path)
-    steps = [step for key, step, *_ in journaled(folder.path) if key == "actions/epsilon"]
-    assert steps == sorted(set(steps))
-    with closing(sqlite3.connect(outputs / "mlflow.db")) as database:
-        assert database.execute("SELECT count(*) FROM runs").fetchall() == [(1,)]
+    assert folder.status == "KILLED"
+
+
+def test_the_next_command_tells_mlflow_of_a_run_that_was_killed(tiny: Compose) -> None:
+    config = tiny(*SHORT, "budget.steps=20", "tracking=mlflow")
+    outputs = Path(config.paths.outputs)
+    train(config)
+    journal = Journal(run_of(config).path)
+    journal.status("RUNNING")
+    publish(run_of(config).path, Store(outputs))
+
+    def shown() -> list[tuple[str, str]]:
+        query = "SELECT status, value FROM runs JOIN tags USING (run_uuid) WHERE key = 'resumable'"
+        with closing(sqlite3.connect(outputs / "mlflow.db")) as database:
+            return database.execute(query).fetchall()
+
+    assert shown() == [("RUNNING", "false")]
+    settle(outputs)
+    assert shown() == [("KILLED", "true")]
 
 
 @contextmanager
@@ -438,20 +440,28 @@ def test_a_sweep_runs_what_is_missing_and_tables_what_it_found(tiny: Compose, ti
 @pytest.mark.parametrize(
     "overrides",
     [
-        ("model=cnn", "env.num_envs=1", "phase.quick.steps=10_000"),
-        ("model=resnet", "env.size=16", "env.num_envs=8", "env.workers=2", "phase.quick.steps=10_000"),
+        ("model=cnn", "env.num_envs=1", "phase.quick.steps=20_000"),
+        ("model=resnet", "env.size=16", "env.num_envs=8", "env.workers=2", "phase.quick.steps=20_000"),
     ],
 )
 @pytest.mark.timeout(1_200)  # seconds
-def test_a_training_killed_twenty_times_is_the_unbroken_one(
+def test_a_training_killed_twenty_times_is_the_unbroken_one_and_mlflow_has_each_point_once(
     tiny: Compose, tiny_overrides: tuple[str, ...], tmp_path: Path, overrides: tuple[str, ...]
 ) -> None:
-    chosen = (*overrides, "evaluation.every_steps=null", "tracking.histogram_episodes=100")
+    chosen = (*overrides, "evaluation.every_steps=null", "tracking.histogram_episodes=100", "tracking.every_steps=100")
     config = tiny(*chosen)
     assert train_and_kill(config, (*tiny_overrides, *chosen), tmp_path / "unbroken", 0) == 0
-    struck = train_and_kill(config, (*tiny_overrides, *chosen), tmp_path / "killed", 20)
-    assert struck >= 5
-    assert fingerprints(config, tmp_path / "unbroken") == fingerprints(config, tmp_path / "killed")
+    killed = tmp_path / "killed"
+    struck = train_and_kill(config, (*tiny_overrides, *chosen, "tracking=mlflow"), killed, 20)
+    assert struck >= 15  # each after a commit of its own session; the last ones may find the training at its end
+    assert fingerprints(config, tmp_path / "unbroken") == fingerprints(config, killed)
+    shown = points(killed, config.run_name())
+    assert shown == journaled(killed / "runs" / config.run_name())
+    for key in {point[0] for point in shown}:
+        steps = [step for other, step, *_ in shown if other == key]
+        assert steps == sorted(steps)
+        if not key.startswith("score/") or config.env.num_envs == 1:  # episodes of one step are points of one step
+            assert len(set(steps)) == len(steps)
 
 
 @pytest.mark.slow
