@@ -19,8 +19,9 @@ def report(config: ReportConfig) -> None:
     if not runs:
         print(f"there is no run under {outputs / 'runs'} yet")
         return
+    shown = outputs.relative_to(Path.cwd()) if outputs.is_relative_to(Path.cwd()) else outputs
     columns = ("run", "steps", "mean", "+-", "median", "IQM", "high", "low", "random", "episodes")
-    table = Table(*columns, title=f"last evaluations of the runs in {outputs}")
+    table = Table(*columns, title=f"last evaluations of the runs in {shown}")
     for column in table.columns[1:]:
         column.justify = "right"
     for run in runs:
@@ -43,7 +44,7 @@ def report(config: ReportConfig) -> None:
     for run in runs:
         if run.result is not None:
             console.print(f"\n{run.name}\n{run.result.report}", markup=False)
-    console.print(f"\nthe MLflow UI: make ui (python -m atlantis_exp ui paths.outputs={outputs})", markup=False)
+    console.print(f"\nthe MLflow UI: make ui, or python -m atlantis_exp ui paths.outputs={shown}", markup=False)
 
 
 def main() -> None:
