@@ -125,7 +125,7 @@ class RunFolder:
 def settle(outputs: Path) -> None:
     """Say of runs whose process was killed that they are interrupted, and send MLflow what a command had to leave."""
     unreachable: set[str] = set()
-    for path in sorted((outputs / "runs").glob("*/commit.json")):
+    for path in sorted(outputs.glob("*/*/commit.json")):
         folder = RunFolder(path.parent)
         try:
             if folder.status == "RUNNING" and not folder._is_held():

@@ -245,20 +245,22 @@ class _Cursor:
 
     store: str
     identity: str
-    run_id: str
+    run_id: str = ""
     offset: int = 0
     status: str = ""
 
     @classmethod
     def of(cls, folder: Path, store: Store, commit: Commit) -> "_Cursor":
         """Returns the folder's cursor in this store, at the start of a found or new run if there is none."""
-        if (cursor := cls.read(folder)) is not None:
-            if (cursor.store, cursor.identity) == (store.address, commit.identity):
-                return cursor
-            if cursor.store == store.address:
+        cursor = cls.read(folder)
+        if cursor is None or (cursor.store, cursor.identity) != (store.address, commit.identity):
+            if cursor is not None and cursor.store == store.address and cursor.run_id:
                 store.delete_run(cursor.run_id)  # it shows lines that the journal has taken back
-        cursor = cls(store.address, commit.identity, store.open_run(folder, commit))
-        cursor.save(folder)
+            cursor = cls(store.address, commit.identity)
+            cursor.save(folder)  # should MLflow be out of reach, `unfinished` tells others where it is to go
+        if not cursor.run_id:
+            cursor = replace(cursor, run_id=store.open_run(folder, commit))
+            cursor.save(folder)
         return cursor
 
     @classmethod

@@ -17,7 +17,7 @@ import pytest
 
 from atlantis_exp.tracking import store as store_module
 from atlantis_exp.tracking.journal import Journal, Metrics, read
-from atlantis_exp.tracking.store import Publisher, Store, publish
+from atlantis_exp.tracking.store import Publisher, Store, publish, unfinished
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -199,7 +199,7 @@ from atlantis_exp.tracking import store
 save, calls = store._Cursor.save, []
 def save_or_die(cursor, folder):
     calls.append(cursor)
-    if len(calls) == 4:
+    if len(calls) == 5:
         os.kill(os.getpid(), signal.SIGKILL)
     save(cursor, folder)
 store._Cursor.save = save_or_die
@@ -264,7 +264,7 @@ def test_points_of_one_millisecond_survive_a_break_between_their_batches(
 
     def save_once(cursor: Any, folder: Path) -> None:
         saves.append(cursor.offset)
-        if len(saves) == 2:
+        if len(saves) == 3:
             raise OSError("no space")
         save(cursor, folder)
 
@@ -433,6 +433,35 @@ def test_a_folder_that_never_committed_is_left_alone(tmp_path: Path, store: Stor
     assert not (tmp_path / "published.json").exists()
 
 
+def test_a_folder_remembers_the_store_that_lacks_a_part_of_it(tmp_path: Path, store: Store) -> None:
+    away = Store(tmp_path, "sweep", "http://127.0.0.1:9")
+    journal = a_full_journal(tmp_path)
+    assert unfinished(tmp_path, tmp_path) is None
+    with pytest.raises(Exception, match="refused"):
+        publish(tmp_path, away)
+    lacking = unfinished(tmp_path, tmp_path)
+    assert lacking is not None
+    assert lacking.address == away.address
+    publish(tmp_path, store)
+    assert unfinished(tmp_path, tmp_path) is None
+    journal.status("FINISHED")
+    lacking = unfinished(tmp_path, store._root)
+    assert lacking is not None
+    assert lacking.address == store.address
+
+
+@pytest.mark.parametrize("damaged", ["", "{", '{"store": "a", "identity": "b", "offset": "many"}'])
+def test_a_damaged_note_of_what_was_sent_doubles_nothing(
+    tmp_path: Path, root: Path, store: Store, damaged: str
+) -> None:
+    a_full_journal(tmp_path)
+    publish(tmp_path, store)
+    shown = everything(root, tmp_path)
+    (tmp_path / "published.json").write_text(damaged)
+    publish(tmp_path, store)
+    assert everything(root, tmp_path) == shown
+
+
 def test_runs_are_found_by_name_with_their_folder(tmp_path: Path, store: Store) -> None:
     for name in ("resnet-0", "resnet-1"):
         journal = Journal(tmp_path / name)
@@ -452,7 +481,7 @@ def test_everything_arrives_after_another_writer_held_the_database(tmp_path: Pat
         writer.execute("BEGIN IMMEDIATE")
         publisher = Publisher(tmp_path, store)
         assert not publisher.drain(1.0)
-        assert not (tmp_path / "published.json").exists()
+        assert run_id(tmp_path) == ""
         writer.execute("ROLLBACK")
     assert publisher.drain(30)
     assert everything(root, tmp_path)["metrics"] == journaled_points(tmp_path)
