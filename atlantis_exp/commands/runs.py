@@ -122,8 +122,11 @@ class RunFolder:
             yield  # the kernel lets go when the process ends, however it does
 
 
-def settle(outputs: Path) -> None:
-    """Say of runs whose process was killed that they are interrupted, and send MLflow what a command had to leave."""
+def settle(outputs: Path, continued: Path | None = None) -> None:
+    """Say of runs whose process was killed that they are interrupted, and send MLflow what a command had to leave.
+
+    Not sent is the run in the folder `continued`, which its own session will send while it goes on.
+    """
     unreachable: set[str] = set()
     for path in sorted(outputs.glob("*/*/commit.json")):
         folder = RunFolder(path.parent)
@@ -132,7 +135,8 @@ def settle(outputs: Path) -> None:
                 with suppress(Fault), folder.held():
                     Journal(folder.path).status("KILLED")
                     print(f"run {folder.name} was killed; the command that started it continues it")
-            store = None if folder.status == "RUNNING" else unfinished(folder.path, outputs)
+            is_sent = folder.status == "RUNNING" or folder.path == continued
+            store = None if is_sent else unfinished(folder.path, outputs)
         except Fault as fault:
             print(f"atlantis_exp: {fault}", file=sys.stderr)  # no reason to refuse a command for another run
             continue

@@ -78,8 +78,8 @@ def train(config: Config) -> None:
     from atlantis_exp.commands.runs import RunFolder, settle
 
     outputs = Path(config.paths.outputs)
-    settle(outputs)
     folder = RunFolder(outputs / "runs" / config.run_name())
+    settle(outputs, folder.path if folder.result is None else None)
     if config.resume == "must" and not folder.has_started:
         raise ConfigError(f"resume=must: there is no run {folder.name} under {outputs / 'runs'}")
     if config.resume == "never" and folder.has_started:
