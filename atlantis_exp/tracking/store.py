@@ -9,6 +9,7 @@ import json
 import logging
 import math
 import os
+import shutil
 import sqlite3
 import threading
 import time
@@ -135,7 +136,16 @@ class Store:
         self._root.mkdir(parents=True, exist_ok=True)
         with _locked(self._root / "mlflow.lock"):  # processes that make the tables together break them for good
             if self._is_local:
-                with closing(sqlite3.connect(self._root / "mlflow.db")) as database:
+                database_file = self._root / "mlflow.db"
+                if not database_file.exists():
+                    # MLflow never recovers from a process that dies while it makes the tables: they are made aside.
+                    aside = self._root / "mlflow.aside"
+                    shutil.rmtree(aside, ignore_errors=True)
+                    aside.mkdir()
+                    MlflowClient(f"sqlite:///{aside / 'mlflow.db'}").get_experiment_by_name(self._experiment)
+                    (aside / "mlflow.db").replace(database_file)
+                    shutil.rmtree(aside)
+                with closing(sqlite3.connect(database_file)) as database:
                     database.execute("PRAGMA journal_mode=WAL")  # else one slow reader makes a write fail
             client = MlflowClient(self.uri)
             if experiment := client.get_experiment_by_name(self._experiment):

@@ -337,7 +337,6 @@ class Trainer:
                 "learning/updates": self.learner.updates,
                 "learning/phase": self.plan.phases.index(self.phase),
                 "throughput/frames": self.counters.frames,
-                "throughput/episodes": self.counters.episodes,
                 "throughput/memory": len(self.memory),
                 "throughput/memory_bytes": self.memory.nbytes,
                 "throughput/steps_per_second": self.progress.steps_per_second,
@@ -356,7 +355,7 @@ class Trainer:
         except Stopped:
             return
         self.owes_evaluation = False
-        metrics = {**evaluation.metrics(), "throughput/episodes": self.counters.episodes}
+        metrics = evaluation.metrics()
         self.tracker.metrics(metrics, step)
         scores = [episode.score for episode in evaluation.episodes]
         title = f"evaluation, step {step:,}"

@@ -455,13 +455,14 @@ def test_a_training_killed_twenty_times_is_the_unbroken_one_and_mlflow_has_each_
     struck = train_and_kill(config, (*tiny_overrides, *chosen, "tracking=mlflow"), killed, 20)
     assert struck >= 15  # each after a commit of its own session; the last ones may find the training at its end
     assert fingerprints(config, tmp_path / "unbroken") == fingerprints(config, killed)
+    publish(killed / "runs" / config.run_name(), Store(killed))  # what the last command did not wait for
     shown = points(killed, config.run_name())
     assert shown == journaled(killed / "runs" / config.run_name())
     for key in {point[0] for point in shown}:
         steps = [step for other, step, *_ in shown if other == key]
         assert steps == sorted(steps)
-        if not key.startswith("score/") or config.env.num_envs == 1:  # episodes of one step are points of one step
-            assert len(set(steps)) == len(steps)
+        # Episodes of several environments may end at one step.
+        assert len(set(steps)) == len(steps) or (config.env.num_envs > 1 and key.startswith(("score/", "throughput/")))
 
 
 @pytest.mark.slow

@@ -522,6 +522,26 @@ def test_a_store_out_of_reach_is_reported_once_and_caught_up_with_once_it_is_bac
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "store"]  # nothing in the working directory
 
 
+def test_a_process_killed_while_it_makes_the_tables_breaks_nothing(tmp_path: Path) -> None:
+    killed = f"""
+import os, signal, sqlalchemy
+from pathlib import Path
+from atlantis_exp.tracking.store import Store
+@sqlalchemy.event.listens_for(sqlalchemy.engine.Engine, "after_cursor_execute")
+def die(connection, cursor, statement, *_):
+    if "CREATE TABLE scorers" in statement:
+        os.kill(os.getpid(), signal.SIGKILL)
+Store(Path({str(tmp_path)!r})).client
+"""
+    process = subprocess.run([sys.executable, "-c", killed], cwd=REPOSITORY, check=False)
+    assert process.returncode == -signal.SIGKILL
+    assert Store(tmp_path).runs() == []
+    assert sorted(path.name for path in tmp_path.glob("mlflow*") if "-" not in path.name) == [
+        "mlflow.db",
+        "mlflow.lock",
+    ]
+
+
 @pytest.mark.slow
 def test_eight_processes_start_on_a_fresh_store_at_once(tmp_path: Path) -> None:
     script = f"""
