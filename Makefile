@@ -1,6 +1,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Of torch: the tests' networks are too small to share, and threads that wait for each other slow the whole machine.
+ONE_THREAD := OMP_NUM_THREADS=1
 
 .DEFAULT_GOAL := help
 .PHONY: help setup run test test-all lint ui clean
@@ -21,10 +23,10 @@ run: setup  ## random baseline, both networks trained and evaluated on the CPU, 
 	$(BIN)/python -m atlantis_exp report
 
 test: lint  ## lint, types and the quick tests
-	$(BIN)/python -m pytest -q
+	$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2
 
 test-all: lint  ## every test, the slow ones too
-	$(BIN)/python -m pytest -q -m ''
+	$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2 -m ''
 
 lint: setup  ## ruff and mypy --strict
 	$(BIN)/ruff check .

@@ -238,8 +238,8 @@ def test_curves_of_runs_with_different_num_envs_share_their_steps(
 
 
 def test_a_plan_in_episodes_ends_with_its_last_episode(tiny: Compose, started: Start, tmp_path: Path) -> None:
-    config = tiny("phase.quick.steps=null", "phase.quick.episodes=3", "evaluation.every_steps=null")
-    trainer = started(config, tmp_path)
+    length = ("phase.quick.steps=null", "phase.quick.episodes=3")
+    trainer = started(tiny(*length, "evaluation.every_steps=null", "evaluation.at_end=false"), tmp_path)
     epsilons = []
     while trainer.run(after(1)) == "interrupted":
         epsilons.append((trainer.counters.episodes, trainer.epsilon))
