@@ -19,12 +19,19 @@ from atlantis_exp.game.preprocessing import FrameStack, Preprocessing
 from atlantis_exp.game.vector import Emulators, make_emulators
 from atlantis_exp.learning.allocation import keep_freed_memory
 from atlantis_exp.learning.learner import Learner
-from atlantis_exp.learning.objectives import DQN, DoubleDQN, Objective
-from atlantis_exp.learning.schedules import ConstantEpsilon, ExponentialEpsilon, LinearEpsilon, Schedule
+from atlantis_exp.learning.objectives import DQN, DoubleDQN, Objective, Quantile
+from atlantis_exp.learning.schedules import (
+    ConstantEpsilon,
+    ExponentialEpsilon,
+    LinearEpsilon,
+    LinearStepsEpsilon,
+    Schedule,
+)
 from atlantis_exp.networks.cnn import DQNCnn
 from atlantis_exp.networks.dropout import seed_dropout
+from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
 from atlantis_exp.networks.resnet import ResNetDQN
-from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.replay.samplers import Sampler, TopHalfSampler, UniformSampler
 from atlantis_exp.tracking.journal import Tracker
 from atlantis_exp.training.actor import Actor, ConstantActor, EpsilonGreedy, RandomActor
@@ -36,11 +43,12 @@ from atlantis_exp.training.trainer import Cadence, Evaluate, Phase, Plan, Traine
 
 # The registry: a schema class of `config` to the class that it configures.
 NETWORKS: dict[type, type[nn.Module]] = {cfg.CnnConfig: DQNCnn, cfg.ResNetConfig: ResNetDQN}
-OBJECTIVES: dict[str, type[Objective]] = {"dqn": DQN, "double_dqn": DoubleDQN}
+OBJECTIVES: dict[str, type[Objective]] = {"dqn": DQN, "double_dqn": DoubleDQN, "quantile": Quantile}
 SAMPLERS: dict[type, type[Sampler]] = {cfg.UniformConfig: UniformSampler, cfg.TopHalfConfig: TopHalfSampler}
 SCHEDULES: dict[type, type[Schedule]] = {
     cfg.ExponentialConfig: ExponentialEpsilon,
     cfg.LinearConfig: LinearEpsilon,
+    cfg.LinearStepsConfig: LinearStepsEpsilon,
     cfg.ConstantConfig: ConstantEpsilon,
 }
 OPTIMIZERS: dict[str, type[torch.optim.Optimizer]] = {
@@ -93,12 +101,16 @@ def choose_precision(name: str, device: torch.device) -> str:
     return "bf16" if torch.cpu._is_avx512_bf16_supported() else "fp32"
 
 
-def build_network(model: cfg.CnnConfig | cfg.ResNetConfig, env: cfg.EnvConfig, seed: int, name: str) -> nn.Module:
+def build_network(config: cfg.Config, name: str) -> nn.Module:
     """A network with weights from the named stream; the global generator is as it was."""
-    initial, dropout = stream(seed, name).generate_state(2, np.uint64)
+    env, objective = config.env, config.objective
+    head: Head = DuelingHead if config.model.head == "dueling" else nn.Linear
+    if isinstance(objective, cfg.QuantileConfig):
+        head = partial(QuantileHead, quantiles=objective.quantiles)
+    initial, dropout = stream(config.seed, name).generate_state(2, np.uint64)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(initial >> np.uint64(1)))
-        network = NETWORKS[type(model)]((env.stack, env.size, env.size), len(ACTIONS))
+        network = NETWORKS[type(config.model)]((env.stack, env.size, env.size), len(ACTIONS), head)
     seed_dropout(network, int(dropout >> np.uint64(1)))
     return network
 
@@ -120,16 +132,17 @@ def build_learner(config: cfg.Config) -> Learner:
     keep_freed_memory()
     device = choose_device(config.device)
     target = config.objective.target
-    network = build_network(config.model, config.env, config.seed, "network").to(device)
-    target_network = build_network(config.model, config.env, config.seed, "target").to(device)
+    network = build_network(config, "network").to(device)
+    target_network = build_network(config, "target").to(device)
     if target.start == "copy":
         target_network.load_state_dict(network.state_dict())
     return Learner(
         network,
         target_network,
         build_optimizer(config.optimizer, network),
-        OBJECTIVES[config.objective.name](config.objective.gamma),  # type: ignore[call-arg]
+        OBJECTIVES[config.objective.name](),
         target.tau,
+        target_every=target.every,
         precision=choose_precision(config.training.precision, device),  # type: ignore[arg-type]
         target_mode=target.mode,
     )
@@ -137,6 +150,7 @@ def build_learner(config: cfg.Config) -> Learner:
 
 def build_plan(config: cfg.Config) -> Plan:
     """Phases, schedules and learning cadence."""
+    objective = config.objective
     epsilon = cfg.to_dict(config.epsilon)
     del epsilon["name"]
     phases = []
@@ -149,6 +163,7 @@ def build_plan(config: cfg.Config) -> Plan:
         unit="episodes" if next(iter(config.phase.values())).episodes else "steps",
         phases=phases,
         epsilon=SCHEDULES[type(config.epsilon)](**epsilon),
+        returns=Returns(objective.gamma, objective.n_step, objective.reward_scale, objective.reward_clip),
         learn_every=config.training.learn_every,
         learn_start=config.training.learn_start,
         batch_size=config.training.batch_size,
@@ -159,6 +174,7 @@ def run_evaluation(
     actor: Actor,
     env: cfg.EnvConfig,
     evaluation: cfg.EvaluationConfig,
+    episodes: int,
     progress: Progress,
     stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Evaluation, bytes | None]:
@@ -172,13 +188,13 @@ def run_evaluation(
     def on_episode(episode: Episode) -> None:
         nonlocal played
         played += 1
-        progress.evaluated_episode(played, evaluation.episodes, episode)
+        progress.evaluated_episode(played, episodes, episode)
 
-    with build_emulators(env, min(evaluation.num_envs, evaluation.episodes)) as emulators:
+    with build_emulators(env, min(evaluation.num_envs, episodes)) as emulators:
         result = evaluate(
             actor,
             emulators,
-            episodes=evaluation.episodes,
+            episodes=episodes,
             epsilon=evaluation.epsilon,
             seed=evaluation.seed,
             size=env.size,
@@ -253,6 +269,8 @@ def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: 
             evaluate_episodes=config.evaluation.every_episodes,
             evaluate_steps=config.evaluation.every_steps,
             evaluate_at_end=config.evaluation.at_end,
+            interim_episodes=config.evaluation.interim_episodes or config.evaluation.episodes,
+            final_episodes=config.evaluation.episodes,
         ),
         emulators=build_emulators(env, env.num_envs),
         stack=FrameStack(env.num_envs, env.size, env.stack),

@@ -64,6 +64,7 @@ class CnnConfig:
 
     name: Literal["cnn"]
     input_size: Size  # pixels
+    head: Literal["plain", "dueling", "quantile"]
     smallest: ClassVar[int] = 36  # pixels that three unpadded convolutions need
 
 
@@ -73,6 +74,7 @@ class ResNetConfig:
 
     name: Literal["resnet"]
     input_size: Size  # pixels
+    head: Literal["plain", "dueling", "quantile"]
     smallest: ClassVar[int] = 15  # pixels that the unpadded stem needs
 
 
@@ -83,18 +85,38 @@ ModelConfig = Annotated[CnnConfig | ResNetConfig, Field(discriminator="name")]
 class TargetConfig:
     """The target network: how it starts, follows and normalises."""
 
-    tau: Annotated[float, Field(gt=0, le=1)]  # share of the policy network taken over at each update
+    tau: Annotated[float, Field(gt=0, le=1)]  # share of the policy network taken over
+    every: Count  # updates
     mode: Literal["eval", "train"]
     start: Literal["copy", "independent"]
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
-class ObjectiveConfig:
-    """The bootstrap target and its loss."""
+class DqnConfig:
+    """The bootstrap target of one value, and its loss."""
 
     name: Literal["dqn", "double_dqn"]
     gamma: Annotated[float, Field(ge=0, lt=1)]
+    n_step: Count  # rewards before the bootstrap
+    reward_scale: Positive
+    reward_clip: Positive | None  # after scaling; null: not clipped
     target: TargetConfig
+
+
+@dataclass(config=_STRICT, kw_only=True, frozen=True)
+class QuantileConfig:
+    """The bootstrap target of a distribution's quantiles, and its loss."""
+
+    name: Literal["quantile"]
+    quantiles: Count
+    gamma: Annotated[float, Field(ge=0, lt=1)]
+    n_step: Count  # rewards before the bootstrap
+    reward_scale: Positive
+    reward_clip: Positive | None  # after scaling; null: not clipped
+    target: TargetConfig
+
+
+ObjectiveConfig = Annotated[DqnConfig | QuantileConfig, Field(discriminator="name")]
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
@@ -144,6 +166,16 @@ class LinearConfig:
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
+class LinearStepsConfig:
+    """Linear decay of epsilon over a number of steps."""
+
+    name: Literal["linear_steps"]
+    start: Probability
+    end: Probability
+    steps: Count
+
+
+@dataclass(config=_STRICT, kw_only=True, frozen=True)
 class ConstantConfig:
     """The same epsilon throughout."""
 
@@ -151,7 +183,9 @@ class ConstantConfig:
     value: Probability
 
 
-EpsilonConfig = Annotated[ExponentialConfig | LinearConfig | ConstantConfig, Field(discriminator="name")]
+EpsilonConfig = Annotated[
+    ExponentialConfig | LinearConfig | LinearStepsConfig | ConstantConfig, Field(discriminator="name")
+]
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
@@ -205,6 +239,7 @@ class EvaluationConfig:
     """Episodes at a fixed epsilon, beside the training and without touching it."""
 
     episodes: Count
+    interim_episodes: Count | None  # of an evaluation amid the training; null: as many as at its end
     epsilon: Probability
     every_episodes: Count | None  # training episodes between evaluations; null: none of them
     every_steps: Count | None  # training steps between evaluations; null: none of them
@@ -301,6 +336,11 @@ class Config:
             raise ConfigError(
                 f"env.size={self.env.size}: model '{self.model.name}' needs at least {self.model.smallest} pixels; "
                 f"it is made for {self.model.input_size}"
+            )
+        if (self.objective.name == "quantile") != (self.model.head == "quantile"):
+            raise ConfigError(
+                f"model.head={self.model.head}: does not go with objective.name={self.objective.name}; "
+                "objective=quantile and model.head=quantile need each other"
             )
         if self.training.batch_size > self.replay.capacity:
             raise ConfigError(

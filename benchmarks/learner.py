@@ -50,7 +50,7 @@ def update_of(case: Case) -> Callable[[], None]:
         rng.integers(4, size=case.batch_size),
         np.zeros(case.batch_size, np.float32),
         states[:, 1:],
-        np.zeros(case.batch_size, np.bool_),
+        np.full(case.batch_size, config.objective.gamma, np.float32),
     )
 
 

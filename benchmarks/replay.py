@@ -21,7 +21,7 @@ import psutil
 
 from atlantis_exp.build import build_learner, make_emulator
 from atlantis_exp.config import EnvConfig
-from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.replay.samplers import UniformSampler
 from benchmarks.composition import composed
 from benchmarks.contest import calls_per_second, missing, print_results, print_table, take_turns
@@ -45,6 +45,7 @@ CASES = (
     Case("84_noise", "cnn", None, 512 << 20),
 )
 BATCHES = {"cnn": 128, "resnet": 32}  # transitions
+RETURNS = Returns(0.99)
 
 
 class Arrival(NamedTuple):
@@ -105,7 +106,7 @@ def measure(case: Case, steps: int, transitions: int) -> dict[str, float]:
     sample_s = []
     for _ in range(200):
         began = time.perf_counter()
-        memory.gather(UniformSampler().sample(memory, BATCHES[case.model], rng))
+        memory.gather(UniformSampler().sample(memory, BATCHES[case.model], rng), RETURNS)
         sample_s.append(time.perf_counter() - began)
     return {
         "transitions": len(memory),
@@ -125,12 +126,12 @@ def measure_share(model: str, steps: int, transitions: int, rounds: int, seconds
     fill(memory, list(random_play(config.env, steps)), transitions)
     learner = build_learner(config)
     rng = np.random.default_rng(1)
-    batch = memory.gather(memory.draw(BATCHES[model], rng))
+    batch = memory.gather(memory.draw(BATCHES[model], rng), RETURNS)
     learner.update(*batch)  # the first one allocates
     return take_turns(
         {
             "sample": functools.partial(
-                calls_per_second, lambda: memory.gather(memory.draw(BATCHES[model], rng)), seconds
+                calls_per_second, lambda: memory.gather(memory.draw(BATCHES[model], rng), RETURNS), seconds
             ),
             "update": functools.partial(calls_per_second, lambda: learner.update(*batch), seconds),
         },

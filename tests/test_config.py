@@ -27,6 +27,7 @@ TREES = {
     for name, overrides in {
         "cnn": (),
         "resnet": ("experiment=paper_resnet", "optimizer=rmsprop", "epsilon=linear", "env=atlantis_standard"),
+        "fast": ("experiment=fast",),
         "constant": ("epsilon=constant", "optimizer=adam", "objective=double_dqn", "sampler=top_half"),
     }.items()
 }
@@ -54,6 +55,7 @@ def another(key: str, value: Any) -> Any:
     special = {
         "env.id": ("Atlantis-v0", "ALE/Atlantis-v5"),
         "objective.name": ("dqn", "double_dqn"),
+        "model.head": ("plain", "dueling"),
         "objective.target.mode": ("eval", "train"),
         "objective.target.start": ("copy", "independent"),
         "optimizer.name": ("adam", "adamw"),
@@ -93,7 +95,7 @@ LEAVES = [
     if key.split(".")[0] not in ("sampler", "samplers")
     and not (key.startswith("phase.") and key.endswith((".episodes", ".steps")))
     and key != "epsilon.name"
-    and (name, key) != ("resnet", "optimizer.name")
+    and (name, key) not in (("resnet", "optimizer.name"), ("fast", "objective.name"), ("fast", "model.head"))
 ]
 
 

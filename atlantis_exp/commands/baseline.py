@@ -17,7 +17,9 @@ def baseline(config: BaselineConfig) -> None:
     folder = RunFolder(outputs / "runs" / config.run_name())
     progress = Progress()
     progress.say(f"{config.agent.name} player, {config.evaluation.episodes} episodes of {config.env.id}")
-    evaluation, video = run_evaluation(build_baseline(config.agent), config.env, config.evaluation, progress)
+    evaluation, video = run_evaluation(
+        build_baseline(config.agent), config.env, config.evaluation, config.evaluation.episodes, progress
+    )
     record_evaluation(folder, "baseline", to_dict(config), evaluation, video, config.tracking, outputs)
 
 

@@ -32,7 +32,7 @@ def evaluate(config: EvaluateConfig) -> None:
         raise Fault(f"run {run.name}: the {config.weights} weights cannot be read: {error}") from error
     settings = config.evaluation
     progress.say(f"{run.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
-    evaluation, video = run_evaluation(actor, trained.env, settings, progress)
+    evaluation, video = run_evaluation(actor, trained.env, settings, settings.episodes, progress)
     facts = {"run": run.name, "step": step, "evaluation": to_dict(settings), "env": to_dict(trained.env)}
     folder = RunFolder(outputs / "evaluations" / f"{run.name}-at-{step}-{digest(facts)[:6]}")
     record_evaluation(folder, "evaluation", facts, evaluation, video, config.tracking, outputs)

@@ -9,14 +9,15 @@ import torch
 from torch import nn
 from torch.func import functional_call
 
-from atlantis_exp.learning.objectives import Objective
+from atlantis_exp.learning.objectives import Objective, action_values
 
 _MEASURES = ("loss", "q", "target", "gradient_norm")
 
 
 class Learner:
-    """Learns action values by gradient steps on `network` and a soft update of `target` after each (report figure 2.5).
+    """Learns action values by gradient steps on `network`, which `target` follows by a share `tau` (report figure 2.5).
 
+    `target` moves after every `target_every` updates: with tau below 1 it follows softly, with tau 1 it is a copy.
     Both networks lie on one device, which is where the learner works; `target` is by custom a copy of `network`.
     Weights are float32. With precision "bf16" the forward and backward passes run in bfloat16 (autocast), the loss, the
     optimizer and the soft update in float32.
@@ -37,6 +38,7 @@ class Learner:
         objective: Objective,
         tau: float,
         *,
+        target_every: int = 1,
         precision: Literal["fp32", "bf16"] = "fp32",
         target_mode: Literal["eval", "train"] = "eval",
     ) -> None:
@@ -44,7 +46,8 @@ class Learner:
         self.target = target.train(target_mode == "train")
         self.optimizer = optimizer
         self.objective = objective
-        self.tau = tau  # share of the network that enters the target network, an update
+        self.tau = tau  # share of the network that enters the target network
+        self.target_every = target_every  # updates
         self.dtype = torch.bfloat16 if precision == "bf16" else torch.float32
         self._q_online = _QFunction(network, self.dtype)
         self._q_target = _QFunction(target, self.dtype)
@@ -60,34 +63,36 @@ class Learner:
         s_t: npt.NDArray[np.uint8],
         a_t: npt.NDArray[np.integer],
         r_t: npt.NDArray[np.floating],
-        s_tp1: npt.NDArray[np.uint8],
-        terminated: npt.NDArray[np.bool_],
+        s_tpm: npt.NDArray[np.uint8],
+        discount: npt.NDArray[np.floating],
     ) -> None:
-        """Take one optimizer step on a batch of transitions, then the soft update.
+        """Take one optimizer step on a batch of transitions, then move the target network if its turn has come.
 
-        States (B, C, H, W) in 0..255; actions, rewards and terminated (B,).
+        States (B, C, H, W) in 0..255; actions, rewards and discounts (B,), as `Objective` wants them.
         """
         actions = torch.as_tensor(a_t, dtype=torch.int64, device=self.device)
         rewards = torch.as_tensor(r_t, dtype=torch.float32, device=self.device)
-        ends = torch.as_tensor(terminated, dtype=torch.bool, device=self.device)
+        discounts = torch.as_tensor(discount, dtype=torch.float32, device=self.device)
 
         with torch.no_grad():
-            target_B = self.objective.targets(rewards, self._input(s_tp1), ends, self._q_online, self._q_target)
+            target = self.objective.targets(rewards, self._input(s_tpm), discounts, self._q_online, self._q_target)
         self.network.train()
-        q_BA = self._q_online(self._input(s_t))
+        q = self._q_online(self._input(s_t))
         self.network.eval()
-        loss = self.objective.losses(q_BA, actions, target_B).mean()
+        loss = self.objective.losses(q, actions, target).mean()
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        self._measure(loss.detach(), q_BA.detach(), target_B)
+        self._measure(loss.detach(), q.detach(), target)
         self.optimizer.step()
-        self._soft_update()
+        self._q_online.refresh()
         self.updates += 1
+        if self.updates % self.target_every == 0:
+            self._move_target()
 
     @torch.inference_mode()
     def q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
         """Return the network's values (B, A) of states (B, C, H, W) in 0..255; changes nothing."""
-        values: npt.NDArray[np.float32] = self._q_online(self._input(states)).cpu().numpy()
+        values: npt.NDArray[np.float32] = action_values(self._q_online(self._input(states))).cpu().numpy()
         return values
 
     @property
@@ -162,15 +167,15 @@ class Learner:
         """Return states in [0, 1] in the precision of the forward pass."""
         return torch.from_numpy(states).to(self.device).to(self.dtype).div_(255)
 
-    def _measure(self, loss: torch.Tensor, q_BA: torch.Tensor, target_B: torch.Tensor) -> None:
+    def _measure(self, loss: torch.Tensor, q: torch.Tensor, target: torch.Tensor) -> None:
         gradient_norm = nn.utils.get_total_norm([p.grad for p in self.network.parameters() if p.grad is not None])
-        self._sums += torch.stack((loss, q_BA.mean(), target_B.mean(), gradient_norm))
+        self._sums += torch.stack((loss, q.mean(), target.mean(), gradient_norm))
         self._measured += 1
         first = ~loss.isfinite() & (self._first_nonfinite < 0)
         self._first_nonfinite.masked_fill_(first, self.updates)
 
     @torch.no_grad()
-    def _soft_update(self) -> None:
+    def _move_target(self) -> None:
         torch._foreach_lerp_(list(self.target.parameters()), list(self.network.parameters()), self.tau)
         if self.target_mode == "eval":
             for running, latest in zip(self.target.buffers(), self.network.buffers(), strict=True):
@@ -178,7 +183,6 @@ class Learner:
                     running.lerp_(latest, self.tau)
                 else:
                     running.copy_(latest)
-        self._q_online.refresh()
         self._q_target.refresh()
 
     def _generators(self) -> dict[str, torch.Generator]:
@@ -213,8 +217,8 @@ class _QFunction:
             for name, (master, cast) in self.matrices.items()
         }
         with torch.autocast(states.device.type, torch.bfloat16, enabled=self.dtype is torch.bfloat16):
-            q_BA: torch.Tensor = functional_call(self.network, casts, (states,))
-        return q_BA.float()
+            q: torch.Tensor = functional_call(self.network, casts, (states,))
+        return q.float()
 
     @torch.no_grad()
     def refresh(self) -> None:

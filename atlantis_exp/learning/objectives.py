@@ -8,69 +8,99 @@ import torch
 from torch.nn.functional import smooth_l1_loss
 
 QFunction: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
-"""States (B, C, H, W) in [0, 1] to float32 values (B, A), without gradient and in the mode the learner chose."""
+"""States (B, C, H, W) in [0, 1] to float32 values (B, A), or to N quantiles of each (B, A, N), without gradient and in
+the mode the learner chose."""
 
 
 class Objective(Protocol):
-    """Targets computed without gradient, then a loss per sample that the learner averages over the batch."""
+    """Targets computed without gradient, then a loss per sample that the learner averages over the batch.
+
+    A sample's reward and discount (B,) are those of the m steps from s_t to s_tpm. Discount 0 cuts the bootstrap, as
+    where the episode has terminated; a truncated episode's last transition has its discount.
+    """
 
     def targets(
-        self, r_t: torch.Tensor, s_tp1: torch.Tensor, terminated: torch.Tensor, online: QFunction, target: QFunction
+        self, r_t: torch.Tensor, s_tpm: torch.Tensor, discount: torch.Tensor, online: QFunction, target: QFunction
     ) -> torch.Tensor:
-        """Return the target of each sample, (B,).
-
-        `terminated` (B,) bool cuts the bootstrap; a truncated episode's last transition is not terminated.
-        """
+        """Return the target of each sample, (B,), or its N quantiles, (B, N)."""
         ...
 
-    def losses(self, q_BA: torch.Tensor, a_t: torch.Tensor, target_B: torch.Tensor) -> torch.Tensor:
-        """Return the loss of each sample, (B,)."""
+    def losses(self, q: torch.Tensor, a_t: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """Return the loss of each sample, (B,), from values or quantiles q at s_t and what `targets` returned."""
         ...
+
+
+def action_values(q: torch.Tensor) -> torch.Tensor:
+    """Return the values (B, A) of values (B, A) or of quantiles (B, A, N), whose mean they are."""
+    return q if q.ndim == 2 else q.mean(2)
 
 
 @dataclass(frozen=True)
 class DQN:
     """The target network chooses the next action and values it (Mnih et al. 2015; report figure 2.5)."""
 
-    gamma: float  # discount a step
+    def targets(
+        self,
+        r_t: torch.Tensor,
+        s_tpm: torch.Tensor,
+        discount: torch.Tensor,
+        online: QFunction,  # noqa: ARG002 - only Double DQN asks it
+        target: QFunction,
+    ) -> torch.Tensor:
+        return bootstrapped(r_t, discount, target(s_tpm).amax(1))
+
+    def losses(self, q: torch.Tensor, a_t: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        return smooth_l1_loss(taken(q, a_t), target, reduction="none")
+
+
+@dataclass(frozen=True)
+class DoubleDQN(DQN):
+    """The online network chooses the next action, the target network values it (van Hasselt et al. 2016, equation 4).
+
+    The online network chooses in eval mode, as it does when it acts: without dropout and with running statistics,
+    which s_tpm therefore leaves alone.
+    """
+
+    def targets(
+        self, r_t: torch.Tensor, s_tpm: torch.Tensor, discount: torch.Tensor, online: QFunction, target: QFunction
+    ) -> torch.Tensor:
+        a_tpm = online(s_tpm).argmax(1)
+        return bootstrapped(r_t, discount, taken(target(s_tpm), a_tpm))
+
+
+@dataclass(frozen=True)
+class Quantile:
+    """QR-DQN: N quantiles of the return, whose mean is the value (Dabney et al. 2018, algorithm 1, kappa 1).
+
+    The target network chooses the next action by their mean and gives its quantiles.
+    """
 
     def targets(
         self,
         r_t: torch.Tensor,
-        s_tp1: torch.Tensor,
-        terminated: torch.Tensor,
+        s_tpm: torch.Tensor,
+        discount: torch.Tensor,
         online: QFunction,  # noqa: ARG002 - only Double DQN asks it
         target: QFunction,
     ) -> torch.Tensor:
-        v_tp1 = target(s_tp1).amax(1)
-        return torch.where(terminated, r_t, r_t + self.gamma * v_tp1)
+        z_BAN = target(s_tpm)
+        return bootstrapped(r_t[:, None], discount[:, None], taken(z_BAN, action_values(z_BAN).argmax(1)))
 
-    def losses(self, q_BA: torch.Tensor, a_t: torch.Tensor, target_B: torch.Tensor) -> torch.Tensor:
-        return huber(q_BA, a_t, target_B)
-
-
-@dataclass(frozen=True)
-class DoubleDQN:
-    """The online network chooses the next action, the target network values it (van Hasselt et al. 2016, equation 4).
-
-    The online network chooses in eval mode, as it does when it acts: without dropout and with running statistics,
-    which s_tp1 therefore leaves alone.
-    """
-
-    gamma: float  # discount a step
-
-    def targets(
-        self, r_t: torch.Tensor, s_tp1: torch.Tensor, terminated: torch.Tensor, online: QFunction, target: QFunction
-    ) -> torch.Tensor:
-        a_tp1 = online(s_tp1).argmax(1, keepdim=True)
-        v_tp1 = target(s_tp1).gather(1, a_tp1).squeeze(1)
-        return torch.where(terminated, r_t, r_t + self.gamma * v_tp1)
-
-    def losses(self, q_BA: torch.Tensor, a_t: torch.Tensor, target_B: torch.Tensor) -> torch.Tensor:
-        return huber(q_BA, a_t, target_B)
+    def losses(self, q: torch.Tensor, a_t: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """Return the quantile Huber loss of each sample, (B,): a sum over its quantiles, a mean over the target's."""
+        z_BN = taken(q, a_t)
+        count = z_BN.shape[1]
+        z_BNN, target_BNN = z_BN.unsqueeze(2).expand(-1, -1, count), target.unsqueeze(1).expand(-1, count, -1)
+        midpoint_N1 = (torch.arange(count, device=q.device).unsqueeze(1) + 0.5) / count
+        weight_BNN = (midpoint_N1 - (target_BNN < z_BNN).float()).abs()
+        return (weight_BNN * smooth_l1_loss(z_BNN, target_BNN, reduction="none")).mean(2).sum(1)
 
 
-def huber(q_BA: torch.Tensor, a_t: torch.Tensor, target_B: torch.Tensor) -> torch.Tensor:
-    """Return the smooth L1 loss of the taken actions' values, (B,): half the squared error up to 1, linear beyond."""
-    q_B = q_BA.gather(1, a_t.unsqueeze(1)).squeeze(1)
-    return smooth_l1_loss(q_B, target_B, reduction="none")
+def taken(q: torch.Tensor, a_t: torch.Tensor) -> torch.Tensor:
+    """Return what q, (B, A) or (B, A, N), holds for one action of each sample."""
+    return q[torch.arange(len(a_t), device=q.device), a_t]
+
+
+def bootstrapped(r_t: torch.Tensor, discount: torch.Tensor, v_tpm: torch.Tensor) -> torch.Tensor:
+    """Return rewards plus discounted values, and whatever these are, rewards alone where the discount is 0."""
+    return torch.where(discount == 0, r_t, r_t + discount * v_tpm)

@@ -1,4 +1,4 @@
-"""Epsilon as a function of progress: the share of the training that is over, 0 at its start, 1 at its planned end."""
+"""Epsilon as a function of progress, the share of the training that is over: 0 at its start, 1 at its planned end."""
 
 import math
 from dataclasses import dataclass
@@ -6,9 +6,9 @@ from typing import Protocol
 
 
 class Schedule(Protocol):
-    """A value at every progress >= 0; progress exceeds 1 when a training is prolonged."""
+    """A value at every progress >= 0, after so many steps; progress exceeds 1 when a training is prolonged."""
 
-    def __call__(self, progress: float) -> float: ...
+    def __call__(self, progress: float, steps: int) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class ConstantEpsilon:
 
     value: float
 
-    def __call__(self, progress: float) -> float:  # noqa: ARG002
+    def __call__(self, progress: float, steps: int) -> float:  # noqa: ARG002
         return self.value
 
 
@@ -29,9 +29,21 @@ class LinearEpsilon:
     end: float
     duration: float  # share of the training
 
-    def __call__(self, progress: float) -> float:
+    def __call__(self, progress: float, steps: int) -> float:  # noqa: ARG002
         remaining = max(0.0, 1.0 - progress / self.duration)
         return self.end + (self.start - self.end) * remaining
+
+
+@dataclass(frozen=True)
+class LinearStepsEpsilon:
+    """Epsilon on a straight line from `start` to `end` over the first `steps`, however long the training is."""
+
+    start: float
+    end: float
+    steps: int
+
+    def __call__(self, progress: float, steps: int) -> float:  # noqa: ARG002
+        return LinearEpsilon(self.start, self.end, self.steps)(steps, steps)
 
 
 @dataclass(frozen=True)
@@ -45,5 +57,5 @@ class ExponentialEpsilon:
     end: float
     decay: float  # share of the training
 
-    def __call__(self, progress: float) -> float:
+    def __call__(self, progress: float, steps: int) -> float:  # noqa: ARG002
         return self.end + (self.start - self.end) * math.exp(-progress / self.decay)

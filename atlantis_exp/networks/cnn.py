@@ -3,19 +3,21 @@
 import torch
 from torch import nn
 
+from atlantis_exp.networks.heads import Head
 from atlantis_exp.networks.sizes import convolved
 
 
 class DQNCnn(nn.Module):
     """Three convolutions and two dense layers (report figure 2.1; Mnih et al. 2015).
 
-    Input (B, C, H, W) in [0, 1], output (B, num_actions). The report fixes H = W = 84; here the first dense layer
-    follows from `input_shape` = (C, H, W). Raises ValueError if a side is below `smallest_side`.
+    Input (B, C, H, W) in [0, 1], output that of the `head`, (B, num_actions) by default. The report fixes H = W = 84;
+    here the first dense layer follows from `input_shape` = (C, H, W). Raises ValueError if a side is below
+    `smallest_side`.
     """
 
     smallest_side = 36  # pixels; 36 -> 8 -> 3 -> 1
 
-    def __init__(self, input_shape: tuple[int, int, int], num_actions: int) -> None:
+    def __init__(self, input_shape: tuple[int, int, int], num_actions: int, head: Head = nn.Linear) -> None:
         super().__init__()
         channels, height, width = input_shape
         if min(height, width) < self.smallest_side:
@@ -32,12 +34,12 @@ class DQNCnn(nn.Module):
         self.fc = nn.Sequential(
             nn.Linear(self.feature_size, 512),
             nn.ReLU(),
-            nn.Linear(512, num_actions),
+            head(512, num_actions),
         )
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        q_BA: torch.Tensor = self.fc(self.features(x).flatten(1))
-        return q_BA
+        q: torch.Tensor = self.fc(self.features(x).flatten(1))
+        return q
 
 
 def _last_side(side: int) -> int:

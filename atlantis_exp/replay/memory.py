@@ -1,6 +1,7 @@
 """Transitions by id over a ring of observations."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,14 +20,34 @@ _ENTRY_DTYPES: dict[str, type[np.generic]] = {
 _SEGMENT_DTYPES = _ENTRY_DTYPES | {"data": np.uint8, "dictionary": np.uint8, "envs": np.int64, "newest": np.int64}
 
 
+@dataclass(frozen=True)
+class Returns:
+    """What a transition is worth: up to `n_step` rewards, then the value of the state after them.
+
+    The memory keeps the game's rewards; the learner's are those times `scale`, then clipped to -`clip`..`clip`. They
+    are summed with discount `gamma` a step. Where an episode ends or has come no further yet, the rewards are fewer
+    and what follows is discounted less; after a terminated episode nothing follows.
+    """
+
+    gamma: float
+    n_step: int = 1  # steps
+    scale: float = 1.0
+    clip: float | None = None  # None: not clipped
+
+    def reward(self, r_t: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+        """Return the learner's rewards for the game's."""
+        scaled = self.scale * r_t.astype(np.float64)
+        return scaled if self.clip is None else scaled.clip(-self.clip, self.clip)
+
+
 class Transitions(NamedTuple):
-    """A batch of B transitions; s_t and s_tp1 are two windows on one fresh array and share their common frames."""
+    """A batch of B transitions over m steps each; in memory s_t and s_tpm may share frames."""
 
     s_t: npt.NDArray[np.uint8]  # (B, stack, H, W)
     a_t: npt.NDArray[np.int64]  # (B,)
-    r_t: npt.NDArray[np.float32]  # (B,)
-    s_tp1: npt.NDArray[np.uint8]  # (B, stack, H, W)
-    terminated: npt.NDArray[np.bool_]  # (B,)
+    r_t: npt.NDArray[np.float32]  # (B,), the discounted sum of m rewards
+    s_tpm: npt.NDArray[np.uint8]  # (B, stack, H, W)
+    discount: npt.NDArray[np.float32]  # (B,), of what follows s_tpm: gamma**m, 0 where the episode has terminated
 
 
 class ReplayMemory:
@@ -128,23 +149,31 @@ class ReplayMemory:
         """
         return self._reward[self._successors(ids) % self.capacity]
 
-    def gather(self, ids: npt.NDArray[np.int64]) -> Transitions:
+    def gather(self, ids: npt.NDArray[np.int64], returns: Returns) -> Transitions:
         """Return whole transitions.
 
         Raises:
             ValueError: one of `ids` is not available.
         """
-        newest_first = [self._successors(ids), ids]
-        for _ in range(self.stack - 1):
-            newest_first.append(newest_first[-1] - self._back[newest_first[-1] % self.capacity])
-        frames = self._frames.decode(np.stack(newest_first[::-1], axis=1))
-        slots = newest_first[0] % self.capacity
+        first = last = self._successors(ids)
+        r_t = returns.reward(self._reward[first % self.capacity])
+        steps = np.ones(len(ids), np.int64)
+        for _ in range(returns.n_step - 1):
+            forward = self._forward[last % self.capacity]  # 0 at the end of what is known of an episode
+            last = last + forward
+            reward = returns.reward(self._reward[last % self.capacity])
+            r_t += np.where(forward > 0, returns.gamma**steps * reward, 0.0)
+            steps += forward > 0
+        now, then = self._state(ids), self._state(last)
+        # A step apart, two states have all frames but one in common.
+        frames = self._frames.decode(np.hstack((now, then[:, -1:] if returns.n_step == 1 else then)))
+        terminated = self._terminated[last % self.capacity]
         return Transitions(
-            s_t=frames[:, :-1],
-            a_t=self._action[slots].astype(np.int64),
-            r_t=self._reward[slots],
-            s_tp1=frames[:, 1:],
-            terminated=self._terminated[slots],
+            s_t=frames[:, : self.stack],
+            a_t=self._action[first % self.capacity].astype(np.int64),
+            r_t=r_t.astype(np.float32),
+            s_tpm=frames[:, -self.stack :],
+            discount=np.where(terminated, 0.0, returns.gamma**steps).astype(np.float32),
         )
 
     def segment(self, since: int) -> dict[str, Any]:
@@ -278,6 +307,13 @@ class ReplayMemory:
             self._num_available -= self._available.item(slot)
             self._available[slot] = False
             k += self._forward.item(slot)
+
+    def _state(self, newest: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Return the ids of states' observations, (B, stack), oldest first."""
+        newest_first = [newest]
+        for _ in range(self.stack - 1):
+            newest_first.append(newest_first[-1] - self._back[newest_first[-1] % self.capacity])
+        return np.stack(newest_first[::-1], axis=1)
 
     def _successors(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         slots = ids % self.capacity

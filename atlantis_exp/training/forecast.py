@@ -94,14 +94,14 @@ def forecast(
     sampler = plan.phases[0].sampler
 
     def update() -> None:
-        learner.update(*memory.gather(sampler.sample(memory, plan.batch_size, rng)))
+        learner.update(*memory.gather(sampler.sample(memory, plan.batch_size, rng), plan.returns))
 
     update_seconds = _median_seconds(update, at_least=3, seconds=1.0)
 
-    epsilon = statistics.fmean(plan.epsilon(progress) for progress in np.linspace(0, 1, 101))
+    length = plan.length * (1 if plan.unit == "steps" else _EPISODE_STEPS)
+    epsilon = statistics.fmean(plan.epsilon(progress, int(progress * length)) for progress in np.linspace(0, 1, 101))
     acts = 1 - epsilon**num_envs  # share of the iterations in which any environment asks the network
     seconds_a_step = (play_seconds + acts * act_seconds) / num_envs + update_seconds / plan.learn_every
-    length = plan.length * (1 if plan.unit == "steps" else _EPISODE_STEPS)
     steps = max(1, (length if max_steps is None else min(length, max_steps)) - steps_done)
     stored = min(capacity, steps_done + steps)
     replay_bytes = min(max_bytes, stored * memory.nbytes // memory.next_id)

@@ -14,7 +14,7 @@ from atlantis_exp.game.vector import Emulators, Steps
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.learning.schedules import Schedule
 from atlantis_exp.media import film, score_histogram
-from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.replay.samplers import Sampler
 from atlantis_exp.tracking.journal import Tracker
 from atlantis_exp.training.actor import Actor, Decisions
@@ -25,7 +25,8 @@ from atlantis_exp.training.progress import Progress
 Unit = Literal["episodes", "steps"]
 Outcome = Literal["finished", "budget", "interrupted"]
 Stop = Callable[[], bool]
-Evaluate = Callable[[Progress, Stop], tuple[Evaluation, bytes | None]]
+Evaluate = Callable[[int, Progress, Stop], tuple[Evaluation, bytes | None]]
+"""Plays so many episodes; with a film of the best one, if there is to be one. Raises: Stopped."""
 
 
 class Diverged(RuntimeError):
@@ -48,7 +49,8 @@ class Plan:
 
     unit: Unit
     phases: Sequence[Phase]
-    epsilon: Schedule  # of progress
+    epsilon: Schedule
+    returns: Returns
     learn_every: int  # steps
     learn_start: int  # transitions in the memory
     batch_size: int  # transitions
@@ -78,6 +80,8 @@ class Cadence:
     evaluate_episodes: int | None  # training episodes between two evaluations
     evaluate_steps: int | None  # training steps between two evaluations
     evaluate_at_end: bool
+    interim_episodes: int  # of an evaluation amid the training
+    final_episodes: int  # of the one at its end
 
 
 @dataclass
@@ -170,7 +174,7 @@ class Trainer:
         """The probability that chance takes the next decision."""
         # The report counts the episode under way as one: its first has epsilon(1), not epsilon(0).
         running = 1 if self.plan.unit == "episodes" else 0
-        return self.plan.epsilon((self.done + running) / self.plan.length)
+        return self.plan.epsilon((self.done + running) / self.plan.length, self.counters.steps)
 
     def commit(self) -> None:
         """Make the checkpoint and all metrics up to it durable together, then visible."""
@@ -257,7 +261,7 @@ class Trainer:
             return
         for _ in range(due):
             ids = self.phase.sampler.sample(self.memory, self.plan.batch_size, self.sampling)
-            self.learner.update(*self.memory.gather(ids))
+            self.learner.update(*self.memory.gather(ids, self.plan.returns))
 
     def _observe(self, decisions: Decisions, steps: Steps) -> None:
         self.stack.push(steps.observations)
@@ -351,7 +355,8 @@ class Trainer:
             return
         self.owes_evaluation = True
         try:
-            evaluation, video = self.evaluate(self.progress, self._stop)
+            episodes = self.cadence.final_episodes if self._ended else self.cadence.interim_episodes
+            evaluation, video = self.evaluate(episodes, self.progress, self._stop)
         except Stopped:
             return
         self.owes_evaluation = False

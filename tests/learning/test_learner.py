@@ -13,9 +13,10 @@ from torch.nn.functional import smooth_l1_loss
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from atlantis_exp.learning.learner import Learner
-from atlantis_exp.learning.objectives import DQN, DoubleDQN, Objective
+from atlantis_exp.learning.objectives import DQN, DoubleDQN, Objective, Quantile
 from atlantis_exp.networks.cnn import DQNCnn
 from atlantis_exp.networks.dropout import seed_dropout
+from atlantis_exp.networks.heads import QuantileHead
 from atlantis_exp.networks.resnet import ResNetDQN
 
 Precision = Literal["fp32", "bf16"]
@@ -24,7 +25,7 @@ Batch = tuple[
     npt.NDArray[np.int64],
     npt.NDArray[np.float32],
     npt.NDArray[np.uint8],
-    npt.NDArray[np.bool_],
+    npt.NDArray[np.float32],
 ]
 
 _SIDE = {DQNCnn: 36, ResNetDQN: 31}  # pixels; small, since the tests are about the learner
@@ -56,7 +57,7 @@ def _learner(
     network_class: type[nn.Module],
     *,
     seed: int = 0,
-    objective: Objective = DoubleDQN(0.9),  # noqa: B008 - frozen
+    objective: Objective = DoubleDQN(),  # noqa: B008 - frozen
     tau: float = 0.1,
     precision: Precision = "fp32",
     target_mode: Literal["eval", "train"] = "eval",
@@ -73,7 +74,7 @@ def _batch(side: int, seed: int = 0, size: int = 6) -> Batch:
         rng.integers(0, 4, size),
         rng.choice([0, 1, 100], size).astype(np.float32),
         rng.integers(0, 256, (size, 4, side, side), dtype=np.uint8),
-        rng.random(size) < 0.3,
+        np.where(rng.random(size) < 0.3, 0.0, 0.9).astype(np.float32),
     )
 
 
@@ -113,7 +114,7 @@ def _reference_update(
     network: nn.Module, target: nn.Module, optimizer: torch.optim.Optimizer, batch: Batch, precision: Precision
 ) -> float:
     """Double DQN as the textbook has it: plain autocast, nothing cached, the soft update as a formula."""
-    s_t, a_t, r_t, s_tp1, terminated = (torch.from_numpy(array) for array in batch)
+    s_t, a_t, r_t, s_tpm, discount = (torch.from_numpy(array) for array in batch)
 
     def q(module: nn.Module, states: torch.Tensor) -> torch.Tensor:
         with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
@@ -121,10 +122,10 @@ def _reference_update(
         return values.float()
 
     with torch.no_grad():
-        a_tp1 = q(network.eval(), s_tp1).argmax(1)
-        v_tp1 = q(target.eval(), s_tp1)[range(len(a_tp1)), a_tp1]
+        a_tpm = q(network.eval(), s_tpm).argmax(1)
+        v_tpm = q(target.eval(), s_tpm)[range(len(a_tpm)), a_tpm]
     errors = q(network.train(), s_t)[range(len(a_t)), a_t]
-    loss = smooth_l1_loss(errors, torch.where(terminated, r_t, r_t + 0.9 * v_tp1))
+    loss = smooth_l1_loss(errors, r_t + discount * v_tpm)
     optimizer.zero_grad()
     loss.backward()  # type: ignore[no-untyped-call]
     optimizer.step()
@@ -168,9 +169,9 @@ class _Witness(nn.Module):
 @pytest.mark.parametrize(
     ("objective", "target_mode", "events"),
     [
-        (DQN(0.9), "eval", ["target evaluates 1.0", "network trains 0.2"]),
-        (DQN(0.9), "train", ["target trains 1.0", "network trains 0.2"]),
-        (DoubleDQN(0.9), "eval", ["network evaluates 1.0", "target evaluates 1.0", "network trains 0.2"]),
+        (DQN(), "eval", ["target evaluates 1.0", "network trains 0.2"]),
+        (DQN(), "train", ["target trains 1.0", "network trains 0.2"]),
+        (DoubleDQN(), "eval", ["network evaluates 1.0", "target evaluates 1.0", "network trains 0.2"]),
     ],
 )
 def test_the_online_network_trains_on_s_t_alone(
@@ -180,18 +181,18 @@ def test_the_online_network_trains_on_s_t_alone(
     network, target = _Witness("network", tape), _Witness("target", tape)
     optimizer = torch.optim.SGD(network.parameters(), lr=0.1)
     learner = Learner(network, target, optimizer, objective, 0.1, target_mode=target_mode)
-    s_t, s_tp1 = np.full((2, 4, 1, 1), 51, np.uint8), np.full((2, 4, 1, 1), 255, np.uint8)
-    learner.update(s_t, np.array([0, 1]), np.ones(2, np.float32), s_tp1, np.zeros(2, np.bool_))
+    s_t, s_tpm = np.full((2, 4, 1, 1), 51, np.uint8), np.full((2, 4, 1, 1), 255, np.uint8)
+    learner.update(s_t, np.array([0, 1]), np.ones(2, np.float32), s_tpm, np.full(2, 0.9, np.float32))
     learner.q_values(s_t)
     assert tape == [*events, "network evaluates 0.2"]
 
 
 def test_one_batch_can_be_learned_by_heart() -> None:
     learner = _learner(DQNCnn)
-    s_t, a_t, r_t, s_tp1, _ = _batch(36)
+    s_t, a_t, r_t, s_tpm, _ = _batch(36)
     r_t = r_t.clip(0, 1)
     for _ in range(60):
-        learner.update(s_t, a_t, r_t, s_tp1, np.ones(6, np.bool_))
+        learner.update(s_t, a_t, r_t, s_tpm, np.zeros(6, np.float32))
     np.testing.assert_allclose(learner.q_values(s_t)[range(6), a_t], r_t, atol=0.05)
 
 
@@ -219,16 +220,16 @@ def test_the_target_network_follows_by_tau(tau: float) -> None:
 
 
 def test_a_target_in_train_mode_keeps_running_statistics_of_its_own() -> None:
-    learner = _learner(ResNetDQN, target_mode="train", objective=DQN(0.9), tau=1.0)
-    s_t, a_t, r_t, s_tp1, terminated = _batch(31)
+    learner = _learner(ResNetDQN, target_mode="train", objective=DQN(), tau=1.0)
+    s_t, a_t, r_t, s_tpm, discount = _batch(31)
     stream = learner.target.get_submodule("regression.0").generator
     assert isinstance(stream, torch.Generator)
     before = stream.get_state()
-    learner.update(s_t, a_t, r_t, s_tp1, terminated)
+    learner.update(s_t, a_t, r_t, s_tpm, discount)
     assert not torch.equal(stream.get_state(), before)
     for ours, theirs in zip(learner.target.parameters(), learner.network.parameters(), strict=True):
         assert torch.equal(ours, theirs)
-    # the first normalisation saw s_tp1 through the target's own first weights, not s_t through the network's
+    # the first normalisation saw s_tpm through the target's own first weights, not s_t through the network's
     mean, other = (
         learner.target.get_buffer("block1.2.running_mean"),
         learner.network.get_buffer("block1.2.running_mean"),
@@ -320,9 +321,9 @@ def test_each_statistic_is_what_its_name_says() -> None:
     network, target = _Witness("network", []), _Witness("target", [])
     network.load_state_dict({"values": torch.tensor([1.0, 2, 3, 4])})
     target.load_state_dict({"values": torch.tensor([5.0, 6, 7, 8])})
-    learner = Learner(network, target, torch.optim.SGD(network.parameters(), lr=0.1), DQN(0.5), 0.1)
+    learner = Learner(network, target, torch.optim.SGD(network.parameters(), lr=0.1), DQN(), 0.1)
     states = np.zeros((2, 4, 1, 1), np.uint8)
-    learner.update(states, np.array([0, 1]), np.array([0, 10], np.float32), states, np.array([False, True]))
+    learner.update(states, np.array([0, 1]), np.array([0, 10], np.float32), states, np.array([0.5, 0.0]))
     assert learner.statistics() == {
         "loss": (2.5 + 7.5) / 2,  # |1 - 4| and |2 - 10|, less a half each
         "q": 2.5,
@@ -357,11 +358,11 @@ def test_an_update_never_waits_for_the_device() -> None:
 @pytest.mark.parametrize("poison", [np.inf, np.nan])
 def test_the_first_loss_that_is_no_number_is_remembered(poison: float) -> None:
     learner = _learner(DQNCnn)
-    s_t, a_t, r_t, s_tp1, terminated = _batch(36)
-    learner.update(s_t, a_t, r_t, s_tp1, terminated)
+    s_t, a_t, r_t, s_tpm, discount = _batch(36)
+    learner.update(s_t, a_t, r_t, s_tpm, discount)
     assert learner.first_nonfinite_update() is None
     for _ in range(2):
-        learner.update(s_t, a_t, np.full_like(r_t, poison), s_tp1, terminated)
+        learner.update(s_t, a_t, np.full_like(r_t, poison), s_tpm, discount)
     assert learner.first_nonfinite_update() == 1
     restored = _learner(DQNCnn)
     restored.load_state_dict(_through_disk(learner.state_dict()))
@@ -413,7 +414,7 @@ def test_other_optimizers_continue_too(optimizer_class: type[torch.optim.Optimiz
     def learner(seed: int) -> Learner:
         network, target = _networks(DQNCnn, seed)
         optimizer = optimizer_class(network.parameters(), lr=1e-3)  # type: ignore[call-arg]
-        return Learner(network, target, optimizer, DQN(0.9), 0.1)
+        return Learner(network, target, optimizer, DQN(), 0.1)
 
     unbroken, restored = learner(0), learner(10)
     unbroken.update(*_batch(36))
@@ -426,7 +427,52 @@ def test_other_optimizers_continue_too(optimizer_class: type[torch.optim.Optimiz
 def test_the_learning_rate_reaches_every_parameter_group() -> None:
     network, target = _networks(DQNCnn)
     groups = [{"params": [parameter]} for parameter in network.parameters()]
-    learner = Learner(network, target, torch.optim.AdamW(groups, lr=1e-3), DQN(0.9), 0.1)
+    learner = Learner(network, target, torch.optim.AdamW(groups, lr=1e-3), DQN(), 0.1)
     learner.learning_rate = 3e-4
     assert learner.learning_rate == 3e-4
     assert {group["lr"] for group in learner.optimizer.param_groups} == {3e-4}
+
+
+# The quantile objective and the hard target
+
+
+@every_precision
+def test_a_quantile_learner_learns_one_batch_by_heart_and_acts_by_means(precision: Precision) -> None:
+    def network(seed: int) -> nn.Module:
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            return DQNCnn((4, 36, 36), 4, lambda features, actions: QuantileHead(features, actions, 5))
+
+    online = network(0)
+    optimizer = torch.optim.Adam(online.parameters(), lr=1e-3)
+    learner = Learner(online, network(1), optimizer, Quantile(), 1.0, target_every=10, precision=precision)
+    s_t, a_t, r_t, s_tpm, _ = _batch(36)
+    r_t = r_t.clip(0, 1)
+    for _ in range(80):
+        learner.update(s_t, a_t, r_t, s_tpm, np.zeros(6, np.float32))
+    assert learner.q_values(s_t).shape == (6, 4)
+    np.testing.assert_allclose(learner.q_values(s_t)[range(6), a_t], r_t, atol=0.1)
+
+
+def test_a_hard_target_is_copied_every_so_many_updates_and_stays_in_between() -> None:
+    network, target = _networks(ResNetDQN)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, fused=True)
+    learner = Learner(network, target, optimizer, DQN(), 1.0, target_every=3)
+    before = copy.deepcopy(target)
+    for update in range(1, 8):
+        learner.update(*_batch(31, update))
+        if update in (3, 6):
+            assert _same(target, network)
+            before = copy.deepcopy(target)
+        assert _same(target, before)
+
+
+def test_acting_follows_every_update_though_the_target_stays() -> None:
+    network, target = _networks(DQNCnn)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3)
+    learner = Learner(network, target, optimizer, DQN(), 1.0, target_every=100, precision="bf16")
+    states, *_ = batch = _batch(36)
+    learner.update(*batch)
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        expected = copy.deepcopy(learner.network).eval()(torch.from_numpy(states) / 255).float()
+    np.testing.assert_array_equal(learner.q_values(states), expected.numpy())

@@ -1,61 +1,118 @@
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from atlantis_exp.learning.objectives import DQN, DoubleDQN
+from atlantis_exp.learning.objectives import DQN, DoubleDQN, Quantile, action_values
 
-_GAMMA = 0.9
+every_seed = given(seed=st.integers(0, 1000))
 
 
-def _batch(seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Rewards, terminated, the online and the target network's values at s_tp1, the online network's at s_t."""
+def _batch(seed: int, *quantiles: int) -> tuple[Any, ...]:
+    """Rewards, discounts, the online and the target network's values at s_tpm, the online network's at s_t."""
     rng = np.random.default_rng(seed)
     rewards = torch.from_numpy(rng.choice([0.0, 100.0, 0.3], 9).astype(np.float32))
-    terminated = torch.from_numpy(rng.random(9) < 0.3)
-    online, target, now = (torch.from_numpy(rng.normal(0, 2, (9, 4)).astype(np.float32)) for _ in range(3))
-    return rewards, terminated, online, target, now
+    discounts = torch.from_numpy(rng.choice([0.0, 0.9, 0.81], 9).astype(np.float32))
+    shape = (9, 4, *quantiles)
+    online, target, now = (torch.from_numpy(rng.normal(0, 2, shape).astype(np.float32)) for _ in range(3))
+    return rewards, discounts, online, target, now
 
 
-@given(seed=st.integers(0, 1000))
+@every_seed
 def test_dqn_bootstraps_from_the_target_network_s_best_action(seed: int) -> None:
-    rewards, terminated, online, target, _ = _batch(seed)
-    targets = DQN(_GAMMA).targets(rewards, torch.arange(9), terminated, lambda s: online[s], lambda s: target[s])
+    rewards, discounts, online, target, _ = _batch(seed)
+    targets = DQN().targets(rewards, torch.arange(9), discounts, lambda s: online[s], lambda s: target[s])
     for b in range(9):
-        expected = float(rewards[b])
-        if not terminated[b]:
-            expected += _GAMMA * max(float(q) for q in target[b])
+        expected = float(rewards[b]) + float(discounts[b]) * max(float(q) for q in target[b])
         assert targets[b].item() == pytest.approx(expected, rel=1e-5, abs=1e-5)
 
 
-@given(seed=st.integers(0, 1000))
+@every_seed
 def test_double_dqn_values_the_online_network_s_best_action_by_the_target_network(seed: int) -> None:
-    rewards, terminated, online, target, _ = _batch(seed)
-    targets = DoubleDQN(_GAMMA).targets(rewards, torch.arange(9), terminated, lambda s: online[s], lambda s: target[s])
+    rewards, discounts, online, target, _ = _batch(seed)
+    targets = DoubleDQN().targets(rewards, torch.arange(9), discounts, lambda s: online[s], lambda s: target[s])
     for b in range(9):
-        expected = float(rewards[b])
-        if not terminated[b]:
-            best = max(range(4), key=lambda action: float(online[b, action]))
-            expected += _GAMMA * float(target[b, best])
+        best = max(range(4), key=lambda action: float(online[b, action]))
+        expected = float(rewards[b]) + float(discounts[b]) * float(target[b, best])
         assert targets[b].item() == pytest.approx(expected, rel=1e-5, abs=1e-5)
 
 
-@pytest.mark.parametrize("objective", [DQN(_GAMMA), DoubleDQN(_GAMMA)])
-def test_nothing_comes_through_a_cut_bootstrap(objective: DQN | DoubleDQN) -> None:
-    wild = torch.full((2, 4), torch.inf)
-    targets = objective.targets(torch.tensor([1.0, 2.0]), wild, torch.tensor([True, False]), lambda s: s, lambda s: -s)
-    assert targets.tolist() == [1.0, -torch.inf]
+@every_seed
+def test_the_quantile_targets_are_the_target_network_s_of_its_action_with_the_best_mean(seed: int) -> None:
+    rewards, discounts, online, target, _ = _batch(seed, 5)
+    targets = Quantile().targets(rewards, torch.arange(9), discounts, lambda s: online[s], lambda s: target[s])
+    assert targets.shape == (9, 5)
+    for b in range(9):
+        best = max(range(4), key=lambda action: sum(target[b, action].tolist()))
+        for j in range(5):
+            expected = float(rewards[b]) + float(discounts[b]) * float(target[b, best, j])
+            assert targets[b, j].item() == pytest.approx(expected, rel=1e-5, abs=1e-5)
 
 
-@given(seed=st.integers(0, 1000))
+@pytest.mark.parametrize(
+    ("objective", "shape"), [(DQN(), (2, 4)), (DoubleDQN(), (2, 4)), (Quantile(), (2, 4, 3))], ids=str
+)
+def test_nothing_comes_through_a_cut_bootstrap(objective: DQN | Quantile, shape: tuple[int, ...]) -> None:
+    wild = torch.full(shape, torch.inf)
+    targets = objective.targets(torch.tensor([1.0, 2.0]), wild, torch.tensor([0.0, 0.9]), lambda s: s, lambda s: -s)
+    assert targets[0].unique().tolist() == [1.0]
+    assert targets[1].unique().tolist() == [-torch.inf]
+
+
+@every_seed
 def test_the_loss_is_huber_s_of_the_taken_action(seed: int) -> None:
     rewards, _, _, _, q_BA = _batch(seed)
     actions = torch.from_numpy(np.random.default_rng(seed).integers(0, 4, 9))
-    for objective in (DQN(_GAMMA), DoubleDQN(_GAMMA)):
+    for objective in (DQN(), DoubleDQN()):
         losses = objective.losses(q_BA, actions, rewards)
         assert losses.shape == (9,)
         for b in range(9):
-            error = abs(float(q_BA[b, int(actions[b])]) - float(rewards[b]))
-            expected = error * error / 2 if error < 1 else error - 0.5
-            assert losses[b].item() == pytest.approx(expected, rel=1e-5, abs=1e-6)
+            assert losses[b].item() == pytest.approx(_huber(float(q_BA[b, int(actions[b])] - rewards[b])), abs=1e-5)
+
+
+@every_seed
+def test_the_quantile_loss_is_the_paper_s_sum_written_out(seed: int) -> None:
+    """Dabney et al. 2018, equations 9 and 10 with kappa 1, and algorithm 1."""
+    quantiles = 3
+    _, _, _, target, z_BAN = _batch(seed, quantiles)
+    actions = torch.from_numpy(np.random.default_rng(seed).integers(0, 4, 9))
+    target_BN = target[:, 0]
+    losses = Quantile().losses(z_BAN, actions, target_BN)
+    assert losses.shape == (9,)
+    for b in range(9):
+        expected = 0.0
+        for i in range(quantiles):
+            midpoint = (i / quantiles + (i + 1) / quantiles) / 2
+            for j in range(quantiles):
+                u = float(target_BN[b, j]) - float(z_BAN[b, actions[b], i])
+                expected += abs(midpoint - (1 if u < 0 else 0)) * _huber(u) / quantiles
+        assert losses[b].item() == pytest.approx(expected, rel=1e-5, abs=1e-5)
+
+
+def test_the_quantile_loss_is_least_at_the_quantiles() -> None:
+    """Of targets spread over 100, so wide that the loss is nearly the quantiles' own, not Huber's rounding of it."""
+    z_11N = torch.zeros(1, 1, 4, requires_grad=True)
+    optimizer = torch.optim.Adam([z_11N], lr=1.0)
+    # More targets than quantiles: each step shows some of them.
+    rng = np.random.default_rng(0)
+    for step in range(3_000):
+        optimizer.param_groups[0]["lr"] = 1.0 if step < 2_000 else 0.05
+        target_1N = torch.from_numpy(rng.uniform(0, 100, (64, 4)).astype(np.float32))
+        loss = Quantile().losses(z_11N.expand(64, 1, 4), torch.zeros(64, dtype=torch.int64), target_1N).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    np.testing.assert_allclose(z_11N.detach().flatten(), [12.5, 37.5, 62.5, 87.5], atol=4)
+
+
+def test_the_value_of_an_action_is_the_mean_of_its_quantiles() -> None:
+    z_BAN = torch.tensor([[[1.0, 2.0, 6.0], [0.0, 0.0, 9.0]]])
+    assert action_values(z_BAN).tolist() == [[3.0, 3.0]]
+    assert action_values(z_BAN[:, :, 0]).tolist() == [[1.0, 0.0]]
+
+
+def _huber(error: float) -> float:
+    return error * error / 2 if abs(error) < 1 else abs(error) - 0.5

@@ -11,9 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 
-from atlantis_exp.replay.memory import ReplayMemory, Transitions
+from atlantis_exp.replay.memory import ReplayMemory, Returns, Transitions
 
 SHAPE = (6, 5)
+ONE_STEP = Returns(0.9)
 Frame = npt.NDArray[np.uint8]
 
 
@@ -56,6 +57,7 @@ class Oracle:
     num_observations: int = 0
     states: dict[int, list[tuple[int, Frame]]] = field(default_factory=dict)
     transitions: dict[int, tuple[set[int], list[Frame], int, float, list[Frame], bool]] = field(default_factory=dict)
+    successors: dict[int, int] = field(default_factory=dict)  # of a state's newest observation
 
     def feed(self, memory: ReplayMemory, event: Event) -> None:
         k = self.num_observations
@@ -78,6 +80,7 @@ class Oracle:
             [frame for _, frame in next_state],
             event.terminated,
         )
+        self.successors[state[-1][0]] = k
         self.states[event.env] = next_state
         if event.terminated:
             del self.states[event.env]
@@ -85,15 +88,31 @@ class Oracle:
     def available(self, oldest_id: int) -> list[int]:
         return sorted(k for k, (needs, *_) in self.transitions.items() if min(needs) >= oldest_id)
 
-    def gather(self, ids: list[int]) -> Transitions:
-        _, s_t, a_t, r_t, s_tp1, terminated = zip(*(self.transitions[k] for k in ids), strict=True)
+    def gather(self, ids: list[int], returns: Returns) -> Transitions:
+        s_t, a_t, r_t, s_tpm, discount = zip(*(self.transition(k, returns) for k in ids), strict=True)
         return Transitions(
             np.array(s_t, np.uint8),
             np.array(a_t, np.int64),
             np.array(r_t, np.float32),
-            np.array(s_tp1, np.uint8),
-            np.array(terminated, np.bool_),
+            np.array(s_tpm, np.uint8),
+            np.array(discount, np.float32),
         )
+
+    def transition(self, k: int, returns: Returns) -> tuple[list[Frame], int, float, list[Frame], float]:
+        """The steps from k on, one after the other, until there are enough or no more."""
+        _, s_t, a_t, *_ = self.transitions[k]
+        total, discount = 0.0, 1.0
+        for m in range(1, returns.n_step + 1):
+            _, _, _, reward, s_tpm, terminated = self.transitions[k]
+            reward *= returns.scale
+            if returns.clip is not None:
+                reward = min(max(reward, -returns.clip), returns.clip)
+            total += returns.gamma ** (m - 1) * reward
+            discount = 0.0 if terminated else returns.gamma**m
+            k = self.successors[k]
+            if k not in self.transitions:
+                break
+        return s_t, a_t, total, s_tpm, discount
 
 
 def assert_same_transitions(actual: Transitions, expected: Transitions) -> None:
@@ -123,9 +142,21 @@ def available_ids(memory: ReplayMemory) -> npt.NDArray[np.int64]:
     return np.unique(memory.draw(100 * memory.capacity, np.random.default_rng(0)))
 
 
-@given(capacity=CAPACITIES, noise_frames=NOISE_BUDGETS, stack=st.integers(1, 4), events=EVENTS)
+@given(
+    capacity=CAPACITIES,
+    noise_frames=NOISE_BUDGETS,
+    stack=st.integers(1, 4),
+    events=EVENTS,
+    returns=st.builds(
+        Returns,
+        gamma=st.sampled_from([0.9, 0.0]),
+        n_step=st.integers(1, 6),
+        scale=st.sampled_from([1.0, 0.01]),
+        clip=st.sampled_from([None, 1.0]),
+    ),
+)
 def test_the_memory_is_the_newest_part_of_a_list_of_whole_transitions(
-    capacity: int, noise_frames: int, stack: int, events: list[Event]
+    capacity: int, noise_frames: int, stack: int, events: list[Event], returns: Returns
 ) -> None:
     memory, oracle = memory_of(capacity, noise_frames, stack), Oracle(stack)
     for event in events:
@@ -138,9 +169,8 @@ def test_the_memory_is_the_newest_part_of_a_list_of_whole_transitions(
         ids = oracle.available(memory.oldest_id)
         assert len(memory) == len(ids)
         if ids:
-            expected = oracle.gather(ids)
-            assert_same_transitions(memory.gather(np.array(ids)), expected)
-            np.testing.assert_array_equal(memory.rewards(np.array(ids)), expected.r_t)
+            assert_same_transitions(memory.gather(np.array(ids), returns), oracle.gather(ids, returns))
+            np.testing.assert_array_equal(memory.rewards(np.array(ids)), oracle.gather(ids, ONE_STEP).r_t)
             assert set(memory.draw(50, np.random.default_rng(0)).tolist()) <= set(ids)
 
 
@@ -172,6 +202,7 @@ def test_a_memory_restored_from_segments_is_and_remains_the_unbroken_one(
 
     restored = played(memory_of(capacity, noise_frames), 30)  # to be forgotten
     restored.load_segments(still_needed())
+    three = Returns(0.9, n_step=3)
     twin = Oracle(num_observations=oracle.num_observations, states=dict(oracle.states))
     for i in range(len(later) + 1):
         assert (len(restored), restored.nbytes) == (len(memory), memory.nbytes)
@@ -179,7 +210,7 @@ def test_a_memory_restored_from_segments_is_and_remains_the_unbroken_one(
         if len(memory):
             ids = memory.draw(20, np.random.default_rng(1))
             np.testing.assert_array_equal(restored.draw(20, np.random.default_rng(1)), ids)
-            assert_same_transitions(restored.gather(ids), memory.gather(ids))
+            assert_same_transitions(restored.gather(ids, three), memory.gather(ids, three))
         for event in later[i : i + 1]:
             oracle.feed(memory, event)
             twin.feed(restored, event)
@@ -220,7 +251,7 @@ def test_a_transition_that_is_not_available_is_refused() -> None:
     memory = played(memory_of(20), 100)
     for k in (*range(memory.oldest_id), *range(memory.next_id - 1, memory.next_id + 20)):
         with pytest.raises(ValueError, match="not available"):
-            memory.gather(np.array([memory.draw(1, np.random.default_rng(0))[0], k]))
+            memory.gather(np.array([memory.draw(1, np.random.default_rng(0))[0], k]), ONE_STEP)
         with pytest.raises(ValueError, match="not available"):
             memory.rewards(np.array([k]))
 
@@ -234,9 +265,9 @@ def test_no_transition_aliases_the_observations_it_came_from_nor_the_batch_it_we
         observation[:] = step
         memory.add(0, 0, 0.0, observation, False)
     ids = np.arange(5)
-    for column in memory.gather(ids):
+    for column in memory.gather(ids, ONE_STEP):
         column[:] = 77
-    s_t, _, _, s_tp1, _ = memory.gather(ids)
+    s_t, _, _, s_tp1, _ = memory.gather(ids, ONE_STEP)
     assert s_t[:, :, 0, 0].tolist() == [[0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 2], [0, 1, 2, 3], [1, 2, 3, 4]]
     assert s_tp1[:, :, 0, 0].tolist() == [[0, 0, 0, 1], [0, 0, 1, 2], [0, 1, 2, 3], [1, 2, 3, 4], [2, 3, 4, 5]]
 
@@ -250,7 +281,28 @@ def test_the_last_observation_of_an_episode_is_a_next_state_but_never_a_state() 
         memory.add(0, 0, 0.0, blank, terminated)
     memory.begin(0, blank)
     assert available_ids(memory).tolist() == [0, 1, 3, 4]
-    assert memory.gather(np.array([0, 1, 3, 4])).terminated.tolist() == [False, True, False, False]
+    assert (memory.gather(np.array([0, 1, 3, 4]), ONE_STEP).discount == 0).tolist() == [False, True, False, False]
+
+
+def test_a_return_ends_with_its_episode_and_is_short_where_the_episode_has_come_no_further() -> None:
+    memory = memory_of(40)
+    blank = np.zeros(SHAPE, np.uint8)
+    for ends in (True, False):  # ids 0 to 3 and 4 to 7; the second is truncated, the third under way
+        memory.begin(0, blank)
+        for reward in (100.0, 0.0, -200.0):
+            memory.add(0, 0, reward, blank, ends and reward < 0)
+    memory.begin(0, blank)
+    memory.add(0, 0, 400.0, blank, False)
+    ids = np.array([0, 1, 2, 4, 5, 6, 8])
+    _, _, r_t, _, discount = memory.gather(ids, Returns(0.5, n_step=2))
+    assert r_t.tolist() == [100, -100, -200, 100, -100, -200, 400]
+    assert discount.tolist() == [0.25, 0, 0, 0.25, 0.25, 0.5, 0.5]
+    _, _, r_t, _, discount = memory.gather(ids, Returns(0.5, n_step=3, scale=0.01, clip=1.0))
+    assert r_t.tolist() == [1 - 0.25, -0.5, -1, 1 - 0.25, -0.5, -1, 1]
+    assert discount.tolist() == [0, 0, 0, 0.125, 0.25, 0.5, 0.5]
+    memory.add(0, 0, 800.0, blank, False)
+    _, _, r_t, _, discount = memory.gather(np.array([8]), Returns(0.5, n_step=2))
+    assert (r_t.item(), discount.item()) == (800, 0.25)
 
 
 def test_a_step_without_an_episode_is_refused() -> None:
@@ -274,7 +326,7 @@ def test_an_environment_idle_for_too_long_is_refused_before_its_distance_overflo
         memory.add(1, 0, 0.0, blank, False)
     if idle == 65_534:
         memory.add(0, 3, 5.0, blank, False)
-        assert memory.gather(np.array([0])).r_t.tolist() == [5.0]
+        assert memory.gather(np.array([0]), ONE_STEP).r_t.tolist() == [5.0]
         memory.check_valid()
     else:
         with pytest.raises(ValueError, match="environment 0 was idle for 65,535 observations"):

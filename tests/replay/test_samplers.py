@@ -5,7 +5,7 @@ import numpy.typing as npt
 import pytest
 
 from atlantis_exp.replay.frames import FrameStore
-from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.replay.samplers import Sampler, TopHalfSampler, UniformSampler
 
 
@@ -63,5 +63,5 @@ def test_a_sampler_chooses_before_any_frame_is_decoded(
     monkeypatch.setattr(ReplayMemory, "draw", taped_draw)
     monkeypatch.setattr(FrameStore, "decode", taped_decode)
     memory = memory_with_rewards(np.arange(50.0))
-    memory.gather(sampler.sample(memory, 8, np.random.default_rng(0)))
+    memory.gather(sampler.sample(memory, 8, np.random.default_rng(0)), Returns(0.9))
     assert tape == [("draw", drawn), ("decode", 8 * 5)]

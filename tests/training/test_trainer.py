@@ -10,7 +10,7 @@ import pytest
 
 from atlantis_exp.config import Config
 from atlantis_exp.game.vector import WorkerDied
-from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.replay.samplers import Sampler
 from atlantis_exp.tracking.journal import Metrics, read
 from atlantis_exp.training.actor import ConstantActor
@@ -80,6 +80,7 @@ def test_the_same_seed_gives_the_same_training_and_another_seed_another(
         ("model=cnn", "env.num_envs=1"),
         ("model=cnn", "env.num_envs=3", "env.workers=2", "objective=double_dqn"),
         ("model=resnet", "env.size=16", "env.num_envs=1", "optimizer=rmsprop", "objective.target.mode=train"),
+        ("objective=quantile", "objective.n_step=3", "objective.target.tau=1", "objective.target.every=3"),
         pytest.param(("model=resnet", "env.size=16", "env.num_envs=8", "env.workers=2"), marks=pytest.mark.slow),
         pytest.param(("model=cnn", "env.num_envs=8", "env=atlantis_standard", "env.size=40"), marks=pytest.mark.slow),
     ],
@@ -244,12 +245,12 @@ def test_a_plan_in_episodes_ends_with_its_last_episode(tiny: Compose, started: S
     while trainer.run(after(1)) == "interrupted":
         epsilons.append((trainer.counters.episodes, trainer.epsilon))
     assert (trainer.counters.episodes, trainer.counters.steps) == (3, 120)
-    assert dict(epsilons) == {done: trainer.plan.epsilon((done + 1) / 3) for done in range(3)}
+    assert dict(epsilons) == {done: trainer.plan.epsilon((done + 1) / 3, 0) for done in range(3)}
 
 
 def test_the_phase_at_a_boundary_is_the_one_that_begins_there() -> None:
     phases = [Phase("a", 2, 0.1, None), Phase("b", 1, 0.2, None)]  # type: ignore[arg-type]
-    plan = Plan("steps", phases, lambda _: 0.0, 1, 0, 1)
+    plan = Plan("steps", phases, lambda *_: 0.0, Returns(0.9), 1, 0, 1)
     assert [plan.phase_at(done).name for done in (0, 1, 2, 3, 9)] == ["a", "a", "b", "b", "b"]
 
 
