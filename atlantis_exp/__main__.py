@@ -1,7 +1,6 @@
 """`python -m atlantis_exp [VERB] overrides`: no verb means train; only the verb's own module is imported."""
 
 import importlib
-import os
 import sys
 
 from atlantis_exp.commands import VERBS
@@ -9,9 +8,6 @@ from atlantis_exp.commands import VERBS
 
 def main() -> None:
     """Run the verb that the command line names first."""
-    # Before torch is loaded. Its threads else spin while they wait for each other, and where another process wants the
-    # core, an emulator worker say, an update then takes many times as long.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     first = sys.argv[1] if len(sys.argv) > 1 else ""
     if first in VERBS:
         del sys.argv[1]

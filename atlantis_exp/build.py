@@ -18,7 +18,7 @@ from atlantis_exp.game.emulator import ACTIONS, Emulator
 from atlantis_exp.game.preprocessing import FrameStack, Preprocessing
 from atlantis_exp.game.vector import Emulators, make_emulators
 from atlantis_exp.learning.allocation import keep_freed_memory
-from atlantis_exp.learning.learner import Learner
+from atlantis_exp.learning.learner import Learner, splits
 from atlantis_exp.learning.objectives import DQN, DoubleDQN, Objective, Quantile
 from atlantis_exp.learning.schedules import (
     ConstantEpsilon,
@@ -40,6 +40,8 @@ from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate, repl
 from atlantis_exp.training.forecast import Forecast, forecast
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Cadence, Evaluate, Phase, Plan, Trainer, film_of
+
+_THREADS = torch.get_num_threads()  # torch's own choice, before anything here changes it
 
 # The registry: a schema class of `config` to the class that it configures.
 NETWORKS: dict[type, type[nn.Module]] = {cfg.CnnConfig: DQNCnn, cfg.ResNetConfig: ResNetDQN}
@@ -132,10 +134,13 @@ def build_learner(config: cfg.Config) -> Learner:
     keep_freed_memory()
     device = choose_device(config.device)
     target = config.objective.target
+    threads = config.threads or _THREADS
     network = build_network(config, "network").to(device)
     target_network = build_network(config, "target").to(device)
     if target.start == "copy":
         target_network.load_state_dict(network.state_dict())
+    shards = threads if device.type == "cpu" and splits(network) else 1
+    torch.set_num_threads(threads // shards)
     return Learner(
         network,
         target_network,
@@ -145,6 +150,7 @@ def build_learner(config: cfg.Config) -> Learner:
         target_every=target.every,
         precision=choose_precision(config.training.precision, device),  # type: ignore[arg-type]
         target_mode=target.mode,
+        shards=shards,
     )
 
 
@@ -253,8 +259,6 @@ def build_baseline(agent: cfg.BaselineAgentConfig) -> Actor:
 
 def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: Progress) -> Trainer:
     """All of a run; it writes under `folder` only."""
-    if config.threads:
-        torch.set_num_threads(config.threads)
     env = config.env
     learner = build_learner(config)
     actor = EpsilonGreedy(learner.q_values, len(ACTIONS))

@@ -38,9 +38,9 @@ class Case(NamedTuple):
 CASES = tuple(Case(*network, precision) for network in (("cnn", 128), ("resnet", 32)) for precision in ("bf16", "fp32"))
 
 
-def update_of(case: Case) -> Callable[[], None]:
-    """An update of a learner on a batch of noise."""
-    config = composed(f"model={case.model}", f"training.precision={case.precision}")
+def update_of(case: Case, *overrides: str) -> Callable[[], None]:
+    """An update of a learner on a batch of noise; sets torch's threads to what the learner has in a training."""
+    config = composed(f"model={case.model}", f"training.precision={case.precision}", *overrides)
     learner = build_learner(config)
     rng = np.random.default_rng(0)
     states = rng.integers(0, 256, (case.batch_size, config.env.stack + 1, config.env.size, config.env.size), np.uint8)
@@ -55,7 +55,7 @@ def update_of(case: Case) -> Callable[[], None]:
 
 
 def flops_of(update: Callable[[], None]) -> int:
-    """Floating point operations of the matrix products and convolutions of a call."""
+    """Floating point operations of the matrix products and convolutions that a call makes in this thread."""
     with FlopCounterMode(display=False) as counter:
         update()
     return int(counter.get_total_flops())
@@ -85,18 +85,27 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_args(arguments)
     cases = [case for case in CASES if args.cases is None or case.name in args.cases]
 
+    threads = torch.get_num_threads()
     turns: dict[str, Callable[[], float]] = {}
     flops: dict[str, int] = {}
+
+    def measured(call: Callable[[], None], threads: int) -> Callable[[], float]:
+        def turn() -> float:
+            torch.set_num_threads(threads)
+            return calls_per_second(call, args.seconds)
+
+        torch.set_num_threads(threads)
+        call()  # a first call allocates
+        return turn
+
     for case in cases:
-        gemm, update = gemm_of(case.precision), update_of(case)
-        gemm()
-        update()  # a first call allocates
-        flops[f"gemm_{case.name}"], flops[case.name] = 2 * _SIDE**3, flops_of(update)
-        turns[f"gemm_{case.name}"] = functools.partial(calls_per_second, gemm, args.seconds)
-        turns[case.name] = functools.partial(calls_per_second, update, args.seconds)
+        flops[f"gemm_{case.name}"], flops[case.name] = 2 * _SIDE**3, flops_of(update_of(case, "threads=1"))
+        turns[f"gemm_{case.name}"] = measured(gemm_of(case.precision), threads)
+        update = update_of(case)
+        turns[case.name] = measured(update, torch.get_num_threads())
     calls = take_turns(turns, args.rounds)
 
-    results: dict[str, Any] = {"threads": torch.get_num_threads()}
+    results: dict[str, Any] = {"threads": threads}
     rows = []
     for case in cases:
         rate, gemm_rate = (statistics.median(calls[name]) * flops[name] for name in (case.name, f"gemm_{case.name}"))
@@ -122,7 +131,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             )
         )
     columns = ("", "batch", "FLOPs a sample", "update", "FLOPs", "GEMM", "share")
-    print_table(f"one update, {torch.get_num_threads()} threads", columns, rows)
+    print_table(f"one update, {threads} threads", columns, rows)
     print_results(results)
 
 

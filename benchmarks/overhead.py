@@ -67,9 +67,9 @@ def training(tracked: bool, commit_seconds: float) -> Iterator[Measure[Turn]]:
     """A training that tells where its time goes; with the tracker that a run has, or with none."""
     size, every = batch_of(_NUM_ENVS)
     config = training_config(
+        size,
+        every,
         f"env.num_envs={_NUM_ENVS}",
-        f"training.batch_size={size}",
-        f"training.learn_every={every}",
         f"tracking.commit_seconds={commit_seconds}",
         "evaluation.at_end=true",
     )

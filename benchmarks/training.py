@@ -1,10 +1,10 @@
 """Training speed on the same work as the peers: `python -m benchmarks.training`.
 
 All train Nature's network on whole 84x84 screens of ALE/Atlantis-v5 (skip 4, sticky 0.25, stack 4) with uniform
-replay, Adam and epsilon 0.05, and learn from 8 samples a step: batches of 32 every 4 steps with one environment, of 128
-every 16 steps with more. Each is a process of its own, has learning under way before it is measured, and rests while
-the others have their turns. Stable-Baselines3 has Gymnasium's `AtariPreprocessing`, an environment a process (with one
-environment: none), and `optimize_memory_usage`.
+replay, Adam, a target network copied every 10,000 steps and epsilon 0.05, and learn from 8 samples a step: batches of
+32 every 4 steps with one environment, of 128 every 16 steps with more. Each is a process of its own, has learning under
+way before it is measured, and rests while the others have their turns. Stable-Baselines3 has Gymnasium's
+`AtariPreprocessing`, an environment a process (with one environment: none), and `optimize_memory_usage`.
 """
 
 import argparse
@@ -42,6 +42,7 @@ Program = Callable[[], AbstractContextManager[Measure[float]]]
 
 _CAPACITY = 20_000  # transitions; small, as SB3's take 28 KB each
 _LEARN_START = 1_000  # transitions
+_TARGET_STEPS = 10_000  # between two copies to the target network; SB3's default
 _WARM_UPDATES = 20
 
 
@@ -50,8 +51,8 @@ def batch_of(num_envs: int) -> tuple[int, int]:
     return (32, 4) if num_envs == 1 else (128, 16)
 
 
-def training_config(*overrides: str) -> Config:
-    """The common work as our config."""
+def training_config(batch_size: int, every: int, *overrides: str) -> Config:
+    """The common work as our config, with a batch of transitions every so many steps."""
     return composed(
         "env=atlantis_standard",
         "optimizer=adam",
@@ -63,6 +64,10 @@ def training_config(*overrides: str) -> Config:
         "phase.single.episodes=1_000_000",
         "evaluation.every_episodes=null",
         "evaluation.at_end=false",
+        f"training.batch_size={batch_size}",
+        f"training.learn_every={every}",
+        "objective.target.tau=1",
+        f"objective.target.every={_TARGET_STEPS // every}",
         *overrides,
     )
 
@@ -94,12 +99,7 @@ def steps_per_second(trainer: Trainer, seconds: float) -> float:
 def ours(num_envs: int, precision: str = "auto", batch: tuple[int, int] | None = None) -> Iterator[Measure[float]]:
     """Our trainer with a journal."""
     size, every = batch or batch_of(num_envs)
-    config = training_config(
-        f"env.num_envs={num_envs}",
-        f"training.batch_size={size}",
-        f"training.learn_every={every}",
-        f"training.precision={precision}",
-    )
+    config = training_config(size, every, f"env.num_envs={num_envs}", f"training.precision={precision}")
     with learning(config) as trainer:
         yield functools.partial(steps_per_second, trainer)
 
@@ -108,12 +108,7 @@ def ours(num_envs: int, precision: str = "auto", batch: tuple[int, int] | None =
 def ours_filled(transitions: int, play_steps: int) -> Iterator[Measure[float]]:
     """Our trainer with 16 environments and a replay memory that holds repeated random play."""
     size, every = batch_of(16)
-    config = training_config(
-        "env.num_envs=16",
-        f"training.batch_size={size}",
-        f"training.learn_every={every}",
-        "replay.capacity=1_100_000",
-    )
+    config = training_config(size, every, "env.num_envs=16", "replay.capacity=1_100_000")
     with learning(config) as trainer:
         fill(trainer.memory, list(random_play(config.env, play_steps)), transitions)
         for env in range(16):  # what they played before the filling is too far back to go on from

@@ -177,7 +177,7 @@ def _facts(trainer: "Trainer") -> dict[str, str]:
     return {
         "device": str(trainer.learner.device),
         "precision": str(trainer.learner.dtype).removeprefix("torch."),
-        "threads": str(torch.get_num_threads()),
+        "threads": str(trainer.learner.shards * torch.get_num_threads()),
     }
 
 

@@ -1,17 +1,21 @@
 """The learner: two networks, an optimizer, and the update that moves them."""
 
 import copy
-from typing import Any, Literal
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import nn
-from torch.func import functional_call
 
 from atlantis_exp.learning.objectives import Objective, action_values
 
 _MEASURES = ("loss", "q", "target", "gradient_norm")
+
+T = TypeVar("T")
 
 
 class Learner:
@@ -19,8 +23,13 @@ class Learner:
 
     `target` moves after every `target_every` updates: with tau below 1 it follows softly, with tau 1 it is a copy.
     Both networks lie on one device, which is where the learner works; `target` is by custom a copy of `network`.
-    Weights are float32. With precision "bf16" the forward and backward passes run in bfloat16 (autocast), the loss, the
-    optimizer and the soft update in float32.
+    Weights are float32. With precision "bf16" the forward and backward passes run in bfloat16, the loss, the optimizer
+    and the soft update in float32.
+
+    With several shards a batch is cut into as many parts, each a thread's own from the states to the gradients. Threads
+    then wait for each other once an update, where torch's own wait after every operation: as fast on a quiet machine
+    and several times faster where other programs want the cores too (docs/performance.md). Raises ValueError where the
+    parts would not be independent, since samples meet in batch statistics or masks come from one generator.
 
     The network is in eval mode but for its pass over s_t: acting draws no dropout mask and moves no running statistics.
     The target network is in eval mode too, and its running statistics follow the network's as its parameters do. The
@@ -41,6 +50,7 @@ class Learner:
         target_every: int = 1,
         precision: Literal["fp32", "bf16"] = "fp32",
         target_mode: Literal["eval", "train"] = "eval",
+        shards: int = 1,
     ) -> None:
         self.network = network.eval()
         self.target = target.train(target_mode == "train")
@@ -49,8 +59,13 @@ class Learner:
         self.tau = tau  # share of the network that enters the target network
         self.target_every = target_every  # updates
         self.dtype = torch.bfloat16 if precision == "bf16" else torch.float32
-        self._q_online = _QFunction(network, self.dtype)
-        self._q_target = _QFunction(target, self.dtype)
+        if shards > 1 and not splits(network):
+            raise ValueError("a network with batch statistics or dropout does not split a batch into shards")
+        self.shards = shards
+        self._online = _Replicas(network, self.dtype, shards)
+        self._target = _Replicas(target, self.dtype, shards)
+        if shards > 1:
+            self._threads = ThreadPoolExecutor(shards, "learner", partial(torch.set_num_threads, 1))
         self.target_mode = target_mode
         self.updates = 0
         self.device = next(network.parameters()).device
@@ -70,30 +85,65 @@ class Learner:
 
         States (B, C, H, W) in 0..255; actions, rewards and discounts (B,), as `Objective` wants them.
         """
+        parts = self._in_shards(partial(self._gradients, len(a_t)), s_t, a_t, r_t, s_tpm, discount)
+        for parameter, *gradients in zip(
+            self.network.parameters(), *(gradients for gradients, _ in parts), strict=True
+        ):
+            parameter.grad = sum(gradients[1:], gradients[0].float())
+        self._measure(torch.stack([means for _, means in parts]).sum(0))
+        self.optimizer.step()
+        self._online.refresh()
+        self.updates += 1
+        if self.updates % self.target_every == 0:
+            self._move_target()
+
+    def _gradients(
+        self,
+        batch_size: int,
+        shard: int,
+        s_t: npt.NDArray[np.uint8],
+        a_t: npt.NDArray[np.integer],
+        r_t: npt.NDArray[np.floating],
+        s_tpm: npt.NDArray[np.uint8],
+        discount: npt.NDArray[np.floating],
+    ) -> tuple[list[torch.Tensor | None], torch.Tensor]:
+        """Return a shard's part of the batch's gradients, and of its mean loss, value and target."""
+        online, target_network = self._online.networks[shard], self._target.networks[shard]
         actions = torch.as_tensor(a_t, dtype=torch.int64, device=self.device)
         rewards = torch.as_tensor(r_t, dtype=torch.float32, device=self.device)
         discounts = torch.as_tensor(discount, dtype=torch.float32, device=self.device)
 
         with torch.no_grad():
-            target = self.objective.targets(rewards, self._input(s_tpm), discounts, self._q_online, self._q_target)
-        self.network.train()
-        q = self._q_online(self._input(s_t))
-        self.network.eval()
-        loss = self.objective.losses(q, actions, target).mean()
-        self.optimizer.zero_grad()
+            target = self.objective.targets(
+                rewards, self._input(s_tpm), discounts, lambda s: online(s).float(), lambda s: target_network(s).float()
+            )
+        online.train()
+        q = online(self._input(s_t)).float()
+        online.eval()
+        loss = self.objective.losses(q, actions, target).sum() / batch_size
+        online.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        self._measure(loss.detach(), q.detach(), target)
-        self.optimizer.step()
-        self._q_online.refresh()
-        self.updates += 1
-        if self.updates % self.target_every == 0:
-            self._move_target()
+        gradients = [parameter.grad for parameter in online.parameters()]
+        share = len(a_t) / batch_size
+        return gradients, torch.stack((loss.detach(), share * q.detach().mean(), share * target.mean()))
 
-    @torch.inference_mode()
     def q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
         """Return the network's values (B, A) of states (B, C, H, W) in 0..255; changes nothing."""
-        values: npt.NDArray[np.float32] = action_values(self._q_online(self._input(states))).cpu().numpy()
+        return np.concatenate(self._in_shards(self._values, states))
+
+    @torch.inference_mode()
+    def _values(self, shard: int, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+        q = self._online.networks[shard](self._input(states)).float()
+        values: npt.NDArray[np.float32] = action_values(q).cpu().numpy()
         return values
+
+    def _in_shards(self, function: Callable[..., T], *batch: npt.NDArray[Any]) -> list[T]:
+        """Return what `function` makes of each shard's number and its part of a batch; none of the parts is empty."""
+        count = min(self.shards, len(batch[0]))
+        if count == 1:
+            return [function(0, *batch)]
+        parts = zip(*(np.array_split(array, count) for array in batch), strict=True)
+        return list(self._threads.map(lambda shard, part: function(shard, *part), range(count), parts))
 
     @property
     def learning_rate(self) -> float:
@@ -160,18 +210,18 @@ class Learner:
         self._sums.copy_(state["sums"])
         self._measured = state["measured"]
         self._first_nonfinite.copy_(state["first_nonfinite"])
-        self._q_online.refresh()
-        self._q_target.refresh()
+        self._online.refresh()
+        self._target.refresh()
 
     def _input(self, states: npt.NDArray[np.uint8]) -> torch.Tensor:
         """Return states in [0, 1] in the precision of the forward pass."""
         return torch.from_numpy(states).to(self.device).to(self.dtype).div_(255)
 
-    def _measure(self, loss: torch.Tensor, q: torch.Tensor, target: torch.Tensor) -> None:
+    def _measure(self, means: torch.Tensor) -> None:
         gradient_norm = nn.utils.get_total_norm([p.grad for p in self.network.parameters() if p.grad is not None])
-        self._sums += torch.stack((loss, q.mean(), target.mean(), gradient_norm))
+        self._sums += torch.cat((means, gradient_norm.unsqueeze(0)))
         self._measured += 1
-        first = ~loss.isfinite() & (self._first_nonfinite < 0)
+        first = ~means[0].isfinite() & (self._first_nonfinite < 0)
         self._first_nonfinite.masked_fill_(first, self.updates)
 
     @torch.no_grad()
@@ -183,56 +233,60 @@ class Learner:
                     running.lerp_(latest, self.tau)
                 else:
                     running.copy_(latest)
-        self._q_target.refresh()
+        self._target.refresh()
 
     def _generators(self) -> dict[str, torch.Generator]:
-        """Return the random streams of both networks: whatever their modules hold as `generator`."""
+        """Return the random streams of both networks."""
         return {
-            f"{role}.{name}": module.generator
+            f"{role}.{name}": generator
             for role, network in (("network", self.network), ("target", self.target))
-            for name, module in network.named_modules()
-            if isinstance(getattr(module, "generator", None), torch.Generator)
+            for name, generator in _generators(network)
         }
 
 
-class _QFunction:
-    """A network as a function to float32 values, its passes in float32 or in bfloat16 (autocast).
+def splits(network: nn.Module) -> bool:
+    """Whether what a network makes of a sample depends on that sample alone: no batch statistics, no dropout."""
+    return not any(True for _ in network.buffers()) and not any(True for _ in _generators(network))
 
-    For bfloat16 it keeps casts of the network's matrices: autocast would make the same ones at every call, and for one
-    state that takes longer than the arithmetic. `refresh` them when the parameters have moved.
+
+def _generators(network: nn.Module) -> Iterator[tuple[str, torch.Generator]]:
+    """Yield whatever the modules of a network hold as `generator`."""
+    for name, module in network.named_modules():
+        if isinstance(generator := getattr(module, "generator", None), torch.Generator):
+            yield name, generator
+
+
+class _Replicas:
+    """Copies of a network for a thread each, which share buffers, generators and weights in the precision of the pass.
+
+    In bfloat16 these are the weights of layers with matrices; what normalises stays float32. `refresh` them when the
+    network's own have moved.
     """
 
-    def __init__(self, network: nn.Module, dtype: torch.dtype) -> None:
-        self.network = network
-        self.dtype = dtype
-        self.matrices = {
-            name: (parameter, parameter.detach().to(dtype))
-            for name, parameter in network.named_parameters()
-            if dtype is torch.bfloat16 and parameter.ndim > 1
-        }
-
-    def __call__(self, states: torch.Tensor) -> torch.Tensor:
-        casts = {
-            name: _Cast.apply(master, cast)  # type: ignore[no-untyped-call]
-            for name, (master, cast) in self.matrices.items()
-        }
-        with torch.autocast(states.device.type, torch.bfloat16, enabled=self.dtype is torch.bfloat16):
-            q: torch.Tensor = functional_call(self.network, casts, (states,))
-        return q.float()
+    def __init__(self, network: nn.Module, dtype: torch.dtype, count: int) -> None:
+        with_matrices = [
+            parameter
+            for module in network.modules()
+            if any(parameter.ndim > 1 for parameter in module.parameters(recurse=False))
+            for parameter in module.parameters(recurse=False)
+        ]
+        self._masters: list[torch.Tensor] = [*with_matrices] if dtype is torch.bfloat16 else []
+        self._casts = [parameter.detach().to(dtype) for parameter in self._masters]
+        if not self._casts and count == 1:
+            self.networks = [network]
+            return
+        weights = {id(parameter): parameter.detach() for parameter in network.parameters()}
+        weights |= {id(master): cast for master, cast in zip(self._masters, self._casts, strict=True)}
+        shared = [*network.buffers(), *(generator for _, generator in _generators(network))]
+        self.networks = [
+            copy.deepcopy(
+                network,
+                {id(each): each for each in shared} | {key: nn.Parameter(weight) for key, weight in weights.items()},
+            )
+            for _ in range(count)
+        ]
 
     @torch.no_grad()
     def refresh(self) -> None:
-        for master, cast in self.matrices.values():
-            cast.copy_(master)
-
-
-class _Cast(torch.autograd.Function):
-    """The cast of a matrix that was made before; its gradient goes to the matrix."""
-
-    @staticmethod
-    def forward(ctx: Any, master: torch.Tensor, cast: torch.Tensor) -> torch.Tensor:  # noqa: ARG004
-        return cast.view_as(cast)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None]:  # noqa: ARG004
-        return gradient.float(), None
+        if self._casts:
+            torch._foreach_copy_(self._casts, self._masters)

@@ -61,10 +61,13 @@ def _learner(
     tau: float = 0.1,
     precision: Precision = "fp32",
     target_mode: Literal["eval", "train"] = "eval",
+    shards: int = 1,
 ) -> Learner:
     network, target = _networks(network_class, seed)
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, fused=True)
-    return Learner(network, target, optimizer, objective, tau, precision=precision, target_mode=target_mode)
+    return Learner(
+        network, target, optimizer, objective, tau, precision=precision, target_mode=target_mode, shards=shards
+    )
 
 
 def _batch(side: int, seed: int = 0, size: int = 6) -> Batch:
@@ -200,6 +203,41 @@ def test_targets_send_no_gradient() -> None:
     learner = _learner(DQNCnn)
     learner.update(*_batch(36))
     assert all(parameter.grad is None for parameter in learner.target.parameters())
+
+
+# Shards
+
+
+@every_precision
+@pytest.mark.parametrize("size", [1, 5, 6])
+def test_shards_add_up_to_the_whole_batch(precision: Precision, size: int) -> None:
+    whole, sharded = (_learner(DQNCnn, precision=precision, shards=shards) for shards in (1, 3))
+    batch = _batch(36, size=size)
+    for learner in (whole, sharded):
+        learner.update(*batch)
+    coarse = 2e-2 if precision == "bf16" else 1e-5
+    for one, other in zip(whole.network.parameters(), sharded.network.parameters(), strict=True):
+        assert one.grad is not None
+        assert other.grad is not None
+        torch.testing.assert_close(other.grad, one.grad, rtol=coarse, atol=coarse * float(one.grad.abs().max()))
+    assert sharded.statistics() == {key: pytest.approx(value, rel=coarse) for key, value in whole.statistics().items()}
+    np.testing.assert_allclose(
+        sharded.q_values(batch[0]), sharded.network(torch.from_numpy(batch[0]) / 255).detach(), atol=0.02
+    )
+
+
+@every_precision
+def test_shards_leave_no_bit_to_chance(precision: Precision) -> None:
+    learners = [_learner(DQNCnn, precision=precision, shards=2) for _ in range(2)]
+    for learner in learners:
+        for seed in range(5):
+            learner.update(*_batch(36, seed))
+    torch.testing.assert_close(learners[0].state_dict(), learners[1].state_dict(), rtol=0, atol=0)
+
+
+def test_a_network_whose_samples_meet_is_not_split() -> None:
+    with pytest.raises(ValueError, match="batch statistics"):
+        _learner(ResNetDQN, shards=2)
 
 
 # The soft update
@@ -380,7 +418,8 @@ def test_a_restored_learner_continues_bit_for_bit(
     network_class: type[nn.Module], precision: Precision, target_mode: Literal["eval", "train"]
 ) -> None:
     def learner(seed: int) -> Learner:
-        return _learner(network_class, seed=seed, precision=precision, target_mode=target_mode)
+        shards = 2 if network_class is DQNCnn else 1
+        return _learner(network_class, seed=seed, precision=precision, target_mode=target_mode, shards=shards)
 
     batches = [_batch(_SIDE[network_class], seed) for seed in range(4)]
     unbroken, restored = learner(0), learner(10)
