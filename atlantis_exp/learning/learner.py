@@ -9,7 +9,7 @@ import torch
 from torch import nn
 from torch.func import functional_call
 
-from atlantis_exp.learning.objectives import Objective, action_values
+from atlantis_exp.learning.objectives import Objective, action_values, td_errors
 
 _MEASURES = ("loss", "q", "target", "gradient_norm")
 
@@ -65,10 +65,12 @@ class Learner:
         r_t: npt.NDArray[np.floating],
         s_tpm: npt.NDArray[np.uint8],
         discount: npt.NDArray[np.floating],
-    ) -> None:
+        weights: npt.NDArray[np.floating] | None = None,
+    ) -> torch.Tensor:
         """Take one optimizer step on a batch of transitions, then move the target network if its turn has come.
 
-        States (B, C, H, W) in 0..255; actions, rewards and discounts (B,), as `Objective` wants them.
+        States (B, C, H, W) in 0..255; actions, rewards and discounts (B,), as `Objective` wants them; weights (B,) of
+        the samples in the loss. Returns what each sample's value was off its target by, (B,), on the device.
         """
         actions = torch.as_tensor(a_t, dtype=torch.int64, device=self.device)
         rewards = torch.as_tensor(r_t, dtype=torch.float32, device=self.device)
@@ -79,7 +81,10 @@ class Learner:
         self.network.train()
         q = self._q_online(self._input(s_t))
         self.network.eval()
-        loss = self.objective.losses(q, actions, target).mean()
+        losses = self.objective.losses(q, actions, target)
+        if weights is not None:
+            losses = losses * torch.as_tensor(weights, dtype=torch.float32, device=self.device)
+        loss = losses.mean()
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self._measure(loss.detach(), q.detach(), target)
@@ -88,6 +93,7 @@ class Learner:
         self.updates += 1
         if self.updates % self.target_every == 0:
             self._move_target()
+        return td_errors(q.detach(), actions, target)
 
     @torch.inference_mode()
     def q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
