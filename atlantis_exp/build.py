@@ -21,18 +21,20 @@ from atlantis_exp.learning.allocation import keep_freed_memory
 from atlantis_exp.learning.learner import Learner, splits
 from atlantis_exp.learning.objectives import DQN, DoubleDQN, Objective, Quantile
 from atlantis_exp.learning.schedules import (
-    ConstantEpsilon,
-    ExponentialEpsilon,
-    LinearEpsilon,
-    LinearStepsEpsilon,
+    Constant,
+    Exponential,
+    Linear,
+    LinearSteps,
+    OneCycle,
     Schedule,
 )
 from atlantis_exp.networks.cnn import DQNCnn
 from atlantis_exp.networks.dropout import seed_dropout
 from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
 from atlantis_exp.networks.resnet import ResNetDQN
+from atlantis_exp.networks.resnet_fast import ResNetFast
 from atlantis_exp.replay.memory import ReplayMemory, Returns
-from atlantis_exp.replay.samplers import Sampler, TopHalfSampler, UniformSampler
+from atlantis_exp.replay.samplers import PrioritizedSampler, Sampler, TopHalfSampler, UniformSampler
 from atlantis_exp.tracking.journal import Tracker
 from atlantis_exp.training.actor import Actor, ConstantActor, EpsilonGreedy, RandomActor
 from atlantis_exp.training.checkpoint import Checkpoints
@@ -44,14 +46,23 @@ from atlantis_exp.training.trainer import Cadence, Evaluate, Phase, Plan, Traine
 _THREADS = torch.get_num_threads()  # torch's own choice, before anything here changes it
 
 # The registry: a schema class of `config` to the class that it configures.
-NETWORKS: dict[type, type[nn.Module]] = {cfg.CnnConfig: DQNCnn, cfg.ResNetConfig: ResNetDQN}
+NETWORKS: dict[type, type[nn.Module]] = {
+    cfg.CnnConfig: DQNCnn,
+    cfg.ResNetConfig: ResNetDQN,
+    cfg.ResNetFastConfig: ResNetFast,
+}
 OBJECTIVES: dict[str, type[Objective]] = {"dqn": DQN, "double_dqn": DoubleDQN, "quantile": Quantile}
-SAMPLERS: dict[type, type[Sampler]] = {cfg.UniformConfig: UniformSampler, cfg.TopHalfConfig: TopHalfSampler}
+SAMPLERS: dict[type, type[Sampler]] = {
+    cfg.UniformConfig: UniformSampler,
+    cfg.TopHalfConfig: TopHalfSampler,
+    cfg.PrioritizedConfig: PrioritizedSampler,
+}
 SCHEDULES: dict[type, type[Schedule]] = {
-    cfg.ExponentialConfig: ExponentialEpsilon,
-    cfg.LinearConfig: LinearEpsilon,
-    cfg.LinearStepsConfig: LinearStepsEpsilon,
-    cfg.ConstantConfig: ConstantEpsilon,
+    cfg.ExponentialConfig: Exponential,
+    cfg.LinearConfig: Linear,
+    cfg.LinearStepsConfig: LinearSteps,
+    cfg.ConstantConfig: Constant,
+    cfg.OneCycleConfig: OneCycle,
 }
 OPTIMIZERS: dict[str, type[torch.optim.Optimizer]] = {
     "adamw": torch.optim.AdamW,
@@ -154,11 +165,17 @@ def build_learner(config: cfg.Config) -> Learner:
     )
 
 
+def build_schedule(schedule: cfg.EpsilonConfig | cfg.LrScheduleConfig) -> Schedule:
+    """A function of the training's progress."""
+    settings = cfg.to_dict(schedule)
+    del settings["name"]
+    built: Schedule = SCHEDULES[type(schedule)](**settings)
+    return built
+
+
 def build_plan(config: cfg.Config) -> Plan:
     """Phases, schedules and learning cadence."""
     objective = config.objective
-    epsilon = cfg.to_dict(config.epsilon)
-    del epsilon["name"]
     phases = []
     for name, phase in config.phase.items():
         sampler = cfg.to_dict(config.sampler_of(name))
@@ -168,7 +185,8 @@ def build_plan(config: cfg.Config) -> Plan:
     return Plan(
         unit="episodes" if next(iter(config.phase.values())).episodes else "steps",
         phases=phases,
-        epsilon=SCHEDULES[type(config.epsilon)](**epsilon),
+        epsilon=build_schedule(config.epsilon),
+        learning_rate=build_schedule(config.lr_schedule),
         returns=Returns(objective.gamma, objective.n_step, objective.reward_scale, objective.reward_clip),
         learn_every=config.training.learn_every,
         learn_start=config.training.learn_start,
@@ -231,7 +249,7 @@ def build_network_actor(config: cfg.Config, folder: Path, weights: str, device: 
         step = int(state["best_step"])
     learner = build_learner(dataclasses.replace(config, device=device))
     learner.load_state_dict(state["learner"])
-    return EpsilonGreedy(learner.q_values, len(ACTIONS)), step
+    return EpsilonGreedy(learner.q_values, len(ACTIONS), watches=True), step
 
 
 def build_forecast(config: cfg.Config, steps_done: int) -> Forecast:
@@ -262,7 +280,8 @@ def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: 
     env = config.env
     learner = build_learner(config)
     actor = EpsilonGreedy(learner.q_values, len(ACTIONS))
-    evaluation: Evaluate = partial(run_evaluation, actor, env, config.evaluation)
+    watched = EpsilonGreedy(learner.q_values, len(ACTIONS), watches=True)
+    evaluation: Evaluate = partial(run_evaluation, watched, env, config.evaluation)
     return Trainer(
         plan=build_plan(config),
         cadence=Cadence(

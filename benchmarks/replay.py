@@ -106,7 +106,7 @@ def measure(case: Case, steps: int, transitions: int) -> dict[str, float]:
     sample_s = []
     for _ in range(200):
         began = time.perf_counter()
-        memory.gather(UniformSampler().sample(memory, BATCHES[case.model], rng), RETURNS)
+        memory.gather(UniformSampler().sample(memory, BATCHES[case.model], rng).ids, RETURNS)
         sample_s.append(time.perf_counter() - began)
     return {
         "transitions": len(memory),

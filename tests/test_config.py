@@ -28,7 +28,13 @@ TREES = {
         "cnn": (),
         "resnet": ("experiment=paper_resnet", "optimizer=rmsprop", "epsilon=linear", "env=atlantis_standard"),
         "fast": ("experiment=fast",),
-        "constant": ("epsilon=constant", "optimizer=adam", "objective=double_dqn", "sampler=top_half"),
+        "constant": (
+            "epsilon=constant",
+            "lr_schedule=one_cycle",
+            "optimizer=adam",
+            "objective=double_dqn",
+            "sampler=top_half",
+        ),
     }.items()
 }
 
@@ -64,7 +70,7 @@ def another(key: str, value: Any) -> Any:
         "env.crop": ([0, 160, 210, 0], [16, 160, 96, 0]),
         "env.frameskip": (4, 3),
         "optimizer.betas": ([0.9, 0.999], [0.8, 0.9]),
-        "model.name": ("cnn", "resnet"),
+        "model.name": ("cnn", "resnet", "resnet_fast"),
         "resume": ("auto", "never"),
         "device": ("auto", "cpu"),
         "tracking.name": ("mlflow", "none"),
@@ -94,7 +100,7 @@ LEAVES = [
     # schema: each has a test of its own.
     if key.split(".")[0] not in ("sampler", "samplers")
     and not (key.startswith("phase.") and key.endswith((".episodes", ".steps")))
-    and key != "epsilon.name"
+    and key not in ("epsilon.name", "lr_schedule.name")
     and (name, key) not in (("resnet", "optimizer.name"), ("fast", "objective.name"), ("fast", "model.head"))
 ]
 

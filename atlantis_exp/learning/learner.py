@@ -11,7 +11,7 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from atlantis_exp.learning.objectives import Objective, action_values
+from atlantis_exp.learning.objectives import Objective, action_values, td_errors
 
 _MEASURES = ("loss", "q", "target", "gradient_norm")
 
@@ -80,22 +80,26 @@ class Learner:
         r_t: npt.NDArray[np.floating],
         s_tpm: npt.NDArray[np.uint8],
         discount: npt.NDArray[np.floating],
-    ) -> None:
+        weights: npt.NDArray[np.floating] | None = None,
+    ) -> torch.Tensor:
         """Take one optimizer step on a batch of transitions, then move the target network if its turn has come.
 
-        States (B, C, H, W) in 0..255; actions, rewards and discounts (B,), as `Objective` wants them.
+        States (B, C, H, W) in 0..255; actions, rewards and discounts (B,), as `Objective` wants them; weights (B,) of
+        the samples in the loss. Returns what each sample's value was off its target by, (B,), on the device.
         """
-        parts = self._in_shards(partial(self._gradients, len(a_t)), s_t, a_t, r_t, s_tpm, discount)
-        for parameter, *gradients in zip(
-            self.network.parameters(), *(gradients for gradients, _ in parts), strict=True
-        ):
-            parameter.grad = sum(gradients[1:], gradients[0].float())
-        self._measure(torch.stack([means for _, means in parts]).sum(0))
+        if weights is None:
+            weights = np.ones(len(a_t), np.float32)
+        parts = self._in_shards(partial(self._gradients, len(a_t)), s_t, a_t, r_t, s_tpm, discount, weights)
+        gradients, means, errors = zip(*parts, strict=True)
+        for parameter, first, *others in zip(self.network.parameters(), *gradients, strict=True):
+            parameter.grad = sum(others, first.float())
+        self._measure(torch.stack(means).sum(0))
         self.optimizer.step()
         self._online.refresh()
         self.updates += 1
         if self.updates % self.target_every == 0:
             self._move_target()
+        return torch.cat(errors)
 
     def _gradients(
         self,
@@ -106,8 +110,9 @@ class Learner:
         r_t: npt.NDArray[np.floating],
         s_tpm: npt.NDArray[np.uint8],
         discount: npt.NDArray[np.floating],
-    ) -> tuple[list[torch.Tensor | None], torch.Tensor]:
-        """Return a shard's part of the batch's gradients, and of its mean loss, value and target."""
+        weights: npt.NDArray[np.floating],
+    ) -> tuple[list[torch.Tensor | None], torch.Tensor, torch.Tensor]:
+        """Return a shard's part of the batch's gradients, of its mean loss, value and target, and of its errors."""
         online, target_network = self._online.networks[shard], self._target.networks[shard]
         actions = torch.as_tensor(a_t, dtype=torch.int64, device=self.device)
         rewards = torch.as_tensor(r_t, dtype=torch.float32, device=self.device)
@@ -120,12 +125,14 @@ class Learner:
         online.train()
         q = online(self._input(s_t)).float()
         online.eval()
-        loss = self.objective.losses(q, actions, target).sum() / batch_size
+        losses = self.objective.losses(q, actions, target)
+        loss = (losses * torch.as_tensor(weights, dtype=torch.float32, device=self.device)).sum() / batch_size
         online.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         gradients = [parameter.grad for parameter in online.parameters()]
-        share = len(a_t) / batch_size
-        return gradients, torch.stack((loss.detach(), share * q.detach().mean(), share * target.mean()))
+        q, share = q.detach(), len(a_t) / batch_size
+        means = torch.stack((loss.detach(), share * q.mean(), share * target.mean()))
+        return gradients, means, td_errors(q, actions, target)
 
     def q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
         """Return the network's values (B, A) of states (B, C, H, W) in 0..255; changes nothing."""

@@ -96,6 +96,12 @@ class Quantile:
         return (weight_BNN * smooth_l1_loss(z_BNN, target_BNN, reduction="none")).mean(2).sum(1)
 
 
+def td_errors(q: torch.Tensor, a_t: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """Return how far each sample's value, or its quantiles' mean, is off its target, (B,)."""
+    error = target - taken(q, a_t)
+    return (error if error.ndim == 1 else error.mean(1)).abs()
+
+
 def taken(q: torch.Tensor, a_t: torch.Tensor) -> torch.Tensor:
     """Return what q, (B, A) or (B, A, N), holds for one action of each sample."""
     return q[torch.arange(len(a_t), device=q.device), a_t]

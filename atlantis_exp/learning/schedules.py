@@ -1,4 +1,4 @@
-"""Epsilon as a function of progress, the share of the training that is over: 0 at its start, 1 at its planned end."""
+"""Epsilon, or the learning rate's factor, as a function of progress: 0 at a training's start, 1 at its planned end."""
 
 import math
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ class Schedule(Protocol):
 
 
 @dataclass(frozen=True)
-class ConstantEpsilon:
-    """The same epsilon throughout."""
+class Constant:
+    """The same value throughout."""
 
     value: float
 
@@ -22,8 +22,8 @@ class ConstantEpsilon:
 
 
 @dataclass(frozen=True)
-class LinearEpsilon:
-    """Epsilon on a straight line from `start` to `end` over the first `duration` of the training, then `end`."""
+class Linear:
+    """A straight line from `start` to `end` over the first `duration` of the training, then `end`."""
 
     start: float
     end: float
@@ -35,20 +35,20 @@ class LinearEpsilon:
 
 
 @dataclass(frozen=True)
-class LinearStepsEpsilon:
-    """Epsilon on a straight line from `start` to `end` over the first `steps`, however long the training is."""
+class LinearSteps:
+    """A straight line from `start` to `end` over the first `steps`, then `end`, however long the training is."""
 
     start: float
     end: float
     steps: int
 
     def __call__(self, progress: float, steps: int) -> float:  # noqa: ARG002
-        return LinearEpsilon(self.start, self.end, self.steps)(steps, steps)
+        return Linear(self.start, self.end, self.steps)(steps, steps)
 
 
 @dataclass(frozen=True)
-class ExponentialEpsilon:
-    """Epsilon whose distance to `end` shrinks by a factor e per `decay` and never quite vanishes (report figure 4.1).
+class Exponential:
+    """A value whose distance to `end` shrinks by a factor e per `decay` and never quite vanishes (report figure 4.1).
 
     The report decays from 0.9 to 0.02 by episode with half its number of episodes as constant: `decay` 0.5.
     """
@@ -59,3 +59,22 @@ class ExponentialEpsilon:
 
     def __call__(self, progress: float, steps: int) -> float:  # noqa: ARG002
         return self.end + (self.start - self.end) * math.exp(-progress / self.decay)
+
+
+@dataclass(frozen=True)
+class OneCycle:
+    """Up from `start` to 1 over the first `rise` of the training and down to `end` over the rest, each half a cosine.
+
+    Smith and Topin 2018, in the form of torch's `OneCycleLR`.
+    """
+
+    start: float
+    end: float
+    rise: float  # share of the training
+
+    def __call__(self, progress: float, steps: int) -> float:  # noqa: ARG002
+        if progress < self.rise:
+            foot, climbed = self.start, progress / self.rise
+        else:
+            foot, climbed = self.end, max(0.0, (1.0 - progress) / (1.0 - self.rise))
+        return foot + (1.0 - foot) * (1.0 - math.cos(math.pi * climbed)) / 2

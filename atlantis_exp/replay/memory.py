@@ -141,6 +141,17 @@ class ReplayMemory:
             drawn = np.concatenate((drawn, ids[self._available[ids % self.capacity]]))
         return drawn[:count]
 
+    def available(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+        """Tell which of any ids are available transitions."""
+        return (ids >= self.oldest_id) & (ids < self.next_id) & self._available[ids % self.capacity]
+
+    def completed(self, since: int) -> npt.NDArray[np.int64]:
+        """Return the ids of the available transitions whose last observation has id `since` or a later one."""
+        ids = np.arange(max(since, self.oldest_id), self.next_id)
+        back = self._back[ids % self.capacity]
+        previous = (ids - back)[back > 0]
+        return previous[self.available(previous)]
+
     def rewards(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
         """Return the rewards of transitions without decoding a frame.
 
@@ -316,10 +327,9 @@ class ReplayMemory:
         return np.stack(newest_first[::-1], axis=1)
 
     def _successors(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        slots = ids % self.capacity
-        if not np.all((ids >= self.oldest_id) & (ids < self.next_id) & self._available[slots]):
+        if not np.all(self.available(ids)):
             raise ValueError("replay was asked for a transition that is not available")
-        return ids + self._forward[slots]
+        return ids + self._forward[ids % self.capacity]
 
     def _load_segment(self, segment: dict[str, Any]) -> None:
         for name, dtype in _SEGMENT_DTYPES.items():

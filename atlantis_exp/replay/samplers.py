@@ -1,32 +1,61 @@
 """Which transitions to learn from."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from atlantis_exp.replay.memory import ReplayMemory
 
+_LEAST_ERROR = 1e-6  # added to every error, so that each transition may come again
+
+
+class Draw(NamedTuple):
+    """A batch's transitions, and what each counts in the loss where that is not the same for all."""
+
+    ids: npt.NDArray[np.int64]  # (B,)
+    weights: npt.NDArray[np.float32] | None  # (B,), at most 1
+
 
 class Sampler(Protocol):
-    """Chooses the ids of a batch."""
+    """Chooses the transitions of a batch; whoever gets weights owes it the errors that the batch had."""
 
-    def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> npt.NDArray[np.int64]:
-        """Return `batch_size` ids of available transitions; ValueError if there are none."""
+    def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> Draw:
+        """Draw `batch_size` of the available transitions; ValueError if there are none."""
+
+    def feed_back(self, ids: npt.NDArray[np.int64], errors: npt.NDArray[np.float32]) -> None:
+        """Take note of how far the values of transitions were off their targets, both (B,)."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that a continuation needs, beside the memory."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue exactly where the sampler stood that `state_dict` described."""
+
+
+class _Stateless:
+    def feed_back(self, ids: npt.NDArray[np.int64], errors: npt.NDArray[np.float32]) -> None:
+        pass
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        pass
 
 
 @dataclass(frozen=True)
-class UniformSampler:
+class UniformSampler(_Stateless):
     """Every available transition is as likely as any other."""
 
-    def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> npt.NDArray[np.int64]:
-        """Return `batch_size` ids drawn uniformly with replacement; ValueError if there are none."""
-        return memory.draw(batch_size, rng)
+    def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> Draw:
+        """Draw `batch_size` transitions uniformly with replacement; ValueError if there are none."""
+        return Draw(memory.draw(batch_size, rng), None)
 
 
 @dataclass(frozen=True)
-class TopHalfSampler:
+class TopHalfSampler(_Stateless):
     """Of `oversample` times the batch drawn uniformly, the transitions of highest reward, best first.
 
     With 2, the report's (section 4): "sample twice the specified batch size, sort the samples decreasingly by reward,
@@ -35,7 +64,107 @@ class TopHalfSampler:
 
     oversample: int = 2
 
-    def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> npt.NDArray[np.int64]:
-        """Return `batch_size` ids, chosen by their rewards alone; ValueError if there are none."""
+    def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> Draw:
+        """Draw `batch_size` transitions, chosen by the game's rewards alone; ValueError if there are none."""
         ids = memory.draw(self.oversample * batch_size, rng)
-        return ids[np.argsort(-memory.rewards(ids), kind="stable")[:batch_size]]
+        return Draw(ids[np.argsort(-memory.rewards(ids), kind="stable")[:batch_size]], None)
+
+
+class PrioritizedSampler:
+    """A transition is as likely as its last error to the power `alpha` (Schaul et al. 2016, proportional).
+
+    Weights make up for that, by the power `beta` of the likelihood; the likeliest of a batch has the least, the least
+    likely 1. A new transition has the highest priority that any has had. Draws are stratified: one from each of
+    `batch_size` equal parts of the sum of all priorities.
+
+    Beside the memory it takes 16 to 32 bytes for each observation that this may hold.
+    """
+
+    def __init__(self, alpha: float, beta: float) -> None:
+        self.alpha = alpha
+        self.beta = beta
+        # A binary tree of sums: node n is the sum of 2n and 2n + 1, the leaves are the second half, one a slot of the
+        # memory's ring. A sum is always added up anew, so that the leaves alone decide on all bits.
+        self._tree = np.zeros(2)
+        self._capacity = 0  # of the memory
+        self._highest = 1.0  # priority
+        self._oldest_id = 0  # of the memory when it was last looked at
+        self._next_id = 0
+
+    def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> Draw:
+        """Draw `batch_size` transitions by priority; ValueError if there are none."""
+        if not len(memory):
+            raise ValueError("replay holds no transition to draw")
+        self._look_at(memory)
+        slots = self._find((np.arange(batch_size) + rng.random(batch_size)) / batch_size)
+        while True:
+            ids = memory.oldest_id + (slots - memory.oldest_id) % memory.capacity
+            gone = ~memory.available(ids)  # part of its first state was forgotten
+            if not gone.any():
+                break
+            self._set(slots[gone], np.zeros(np.count_nonzero(gone)))
+            slots[gone] = self._find(rng.random(np.count_nonzero(gone)))
+        priorities = self._leaves[slots]
+        return Draw(ids, ((priorities.min() / priorities) ** self.beta).astype(np.float32))
+
+    def feed_back(self, ids: npt.NDArray[np.int64], errors: npt.NDArray[np.float32]) -> None:
+        """Give transitions that were drawn the priorities of their errors."""
+        # A loss that is no number ends the training, and must not end in an endless search before.
+        priorities = (np.nan_to_num(errors.astype(np.float64)) + _LEAST_ERROR) ** self.alpha
+        self._set(ids % self._capacity, priorities)
+        self._highest = max(self._highest, float(priorities.max()))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that a continuation needs, beside the memory: 8 bytes for each observation that this may hold."""
+        return {
+            "priorities": self._leaves,
+            "highest": self._highest,
+            "oldest_id": self._oldest_id,
+            "next_id": self._next_id,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue exactly where the sampler stood that `state_dict` described."""
+        self._plant(state["priorities"])
+        self._highest = state["highest"]
+        self._oldest_id = state["oldest_id"]
+        self._next_id = state["next_id"]
+
+    @property
+    def _leaves(self) -> npt.NDArray[np.float64]:
+        half = len(self._tree) // 2
+        return self._tree[half : half + self._capacity]
+
+    def _plant(self, priorities: npt.NDArray[np.float64]) -> None:
+        self._capacity = len(priorities)
+        self._tree = np.zeros(2 << (self._capacity - 1).bit_length())
+        self._set(np.arange(self._capacity), priorities)
+
+    def _look_at(self, memory: ReplayMemory) -> None:
+        """Forget what the memory has forgotten, and take in what is new."""
+        if not self._next_id:
+            self._plant(np.zeros(memory.capacity))
+        gone = np.arange(self._oldest_id, min(memory.oldest_id, self._oldest_id + memory.capacity))
+        self._set(gone % memory.capacity, np.zeros(len(gone)))
+        new = memory.completed(self._next_id)
+        self._set(new % memory.capacity, np.full(len(new), self._highest))
+        self._oldest_id, self._next_id = memory.oldest_id, memory.next_id
+
+    def _set(self, slots: npt.NDArray[np.int64], priorities: npt.NDArray[np.float64]) -> None:
+        nodes = slots + len(self._tree) // 2
+        self._tree[nodes] = priorities
+        while len(nodes) and nodes[0] > 1:
+            nodes = np.unique(nodes >> 1)
+            self._tree[nodes] = self._tree[2 * nodes] + self._tree[2 * nodes + 1]
+
+    def _find(self, shares: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+        """Return the slots that lie at these shares, in [0, 1), of the sum of all priorities."""
+        rest = shares * self._tree[1]
+        nodes = np.ones(len(shares), np.int64)
+        while nodes[0] < len(self._tree) // 2:
+            nodes *= 2
+            left = self._tree[nodes]
+            right = (rest >= left) & (self._tree[nodes + 1] > 0)  # rounding must not lead to nothing
+            rest = np.where(right, rest - left, rest)
+            nodes += right
+        return nodes - len(self._tree) // 2

@@ -16,6 +16,7 @@ class Decisions(NamedTuple):
 
     actions: npt.NDArray[np.int64]  # (B,)
     random: npt.NDArray[np.bool_]  # (B,)
+    agrees: npt.NDArray[np.bool_] | None = None  # (B,), with the network's best action, where it was asked for all
 
 
 class Actor(Protocol):
@@ -26,16 +27,24 @@ class Actor(Protocol):
 
 @dataclass(frozen=True)
 class EpsilonGreedy:
-    """The network's best action, or with probability epsilon any action (report figure 3.2)."""
+    """The network's best action, or with probability epsilon any action (report figure 3.2).
+
+    The network is asked only where chance does not choose, unless `watches`: then the decisions say where both agree.
+    """
 
     q_values: Callable[[States], npt.NDArray[np.float32]]
     num_actions: int
+    watches: bool = False
 
     def act(self, states: States, epsilon: float, generators: Generators) -> Decisions:
         random = np.array([generator.random() < epsilon for generator in generators])
         actions = np.empty(len(states), np.int64)
         for row in np.flatnonzero(random).tolist():
             actions[row] = generators[row].integers(self.num_actions)
+        if self.watches:
+            best = self.q_values(states).argmax(axis=1)
+            actions[~random] = best[~random]
+            return Decisions(actions, random, actions == best)
         if not random.all():
             actions[~random] = self.q_values(states[~random]).argmax(axis=1)
         return Decisions(actions, random)

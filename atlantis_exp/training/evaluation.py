@@ -15,6 +15,11 @@ from atlantis_exp.game.vector import Emulators
 from atlantis_exp.statistics import Summary, summarize
 from atlantis_exp.training.actor import Actor
 
+GUNS = {"centre": (100.0, 1_000.0), "side": (200.0, 2_000.0)}
+"""What a step pays when a gun hits one vessel or one bomber; other sums are of several hits or of a wave's end."""
+
+_COLLAPSED = 0.99  # share of the network's decisions that are one action
+
 
 class Stopped(Exception):
     """An evaluation was asked to stop; nothing of it is kept."""
@@ -30,6 +35,8 @@ class Episode:
     truncated: bool = False
     actions: bytearray = field(default_factory=bytearray)  # one a step
     random: bytearray = field(default_factory=bytearray)  # 1 where chance chose
+    agrees: bytearray = field(default_factory=bytearray)  # 1 where that was the network's best action, if it was asked
+    guns: dict[str, float] = field(default_factory=lambda: dict.fromkeys(GUNS, 0.0))  # score that surely is a gun's
 
     @property
     def steps(self) -> int:
@@ -72,10 +79,34 @@ class Evaluation:
         """Share of all decisions that chance took."""
         return float(self.action_counts[:, 1].sum() / self.action_counts.sum())
 
+    @property
+    def chance_agreement(self) -> float | None:
+        """Share of the random decisions that equal the network's best action; None where that is not known."""
+        agrees = [a for episode in self.episodes for a, r in zip(episode.agrees, episode.random, strict=False) if r]
+        return sum(agrees) / len(agrees) if agrees else None
+
+    @property
+    def favourite(self) -> tuple[str, float]:
+        """The action that the network chose most often, and its share of the network's decisions; 0 if it had none."""
+        chosen = self.action_counts[:, 0]
+        return ACTIONS[int(chosen.argmax())], float(chosen.max() / max(1, chosen.sum()))
+
+    @property
+    def collapsed(self) -> bool:
+        """Whether the network has settled on one action, which scores 2,000 when held: a press fires once."""
+        return self.favourite[1] > _COLLAPSED
+
+    @property
+    def policy(self) -> str:
+        """In words, what the network does most."""
+        action, share = self.favourite
+        return f"{'collapsed: ' if self.collapsed else ''}{action} in {share:.1%} of the network's decisions"
+
     def metrics(self) -> dict[str, float]:
         """Everything in one number each, under `evaluation/` and `actions/`."""
         summary = self.summary
         shares = self.action_counts.sum(axis=1) / self.action_counts.sum()
+        agreement = self.chance_agreement
         return {
             "evaluation/mean": summary.mean,
             "evaluation/median": summary.median,
@@ -94,6 +125,13 @@ class Evaluation:
             "actions/random_share_best": self.best.random_share,
             "actions/network_share_best": 1 - self.best.random_share,
             **{f"actions/{action}": float(share) for action, share in zip(ACTIONS, shares, strict=True)},
+            "actions/entropy": float(-sum(share * np.log2(share) for share in shares if share)),  # bits; at most 2
+            "actions/favourite_share": self.favourite[1],
+            **({} if agreement is None else {"actions/random_equals_best": agreement}),
+            **{
+                f"evaluation/score_{gun}_gun": float(np.mean([episode.guns[gun] for episode in self.episodes]))
+                for gun in GUNS
+            },
         }
 
     def table(self) -> str:
@@ -165,7 +203,12 @@ def evaluate(
             episode = played[playing[env]]
             episode.actions.append(int(decisions.actions[row]))
             episode.random.append(bool(decisions.random[row]))
-            episode.score += float(steps.rewards[row])
+            if decisions.agrees is not None:
+                episode.agrees.append(bool(decisions.agrees[row]))
+            reward = float(steps.rewards[row])
+            episode.score += reward
+            for gun, rewards in GUNS.items():
+                episode.guns[gun] += reward if reward in rewards else 0.0
             episode.frames += int(steps.frames[row])
             if steps.terminated[row] or steps.truncated[row]:
                 episode.truncated = bool(steps.truncated[row])

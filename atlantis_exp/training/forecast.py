@@ -94,7 +94,8 @@ def forecast(
     sampler = plan.phases[0].sampler
 
     def update() -> None:
-        learner.update(*memory.gather(sampler.sample(memory, plan.batch_size, rng), plan.returns))
+        ids, weights = sampler.sample(memory, plan.batch_size, rng)
+        learner.update(*memory.gather(ids, plan.returns), weights)
 
     update_seconds = _median_seconds(update, at_least=3, seconds=1.0)
 

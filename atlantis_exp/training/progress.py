@@ -66,6 +66,8 @@ class Progress:
             f"mean {summary.mean:,.0f} +- {summary.standard_error:,.0f}, high {summary.high:,.0f}, "
             f"low {summary.low:,.0f}, interquartile mean {summary.interquartile_mean:,.0f}"
         )
+        if evaluation.collapsed:
+            self.say(f"warning: the policy has {evaluation.policy}; any one action, held, scores 2,000")
 
     def close(self) -> None:
         """End the bar."""

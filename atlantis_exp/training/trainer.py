@@ -7,7 +7,9 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 import safetensors.torch
+import torch
 
 from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.game.vector import Emulators, Steps
@@ -50,6 +52,7 @@ class Plan:
     unit: Unit
     phases: Sequence[Phase]
     epsilon: Schedule
+    learning_rate: Schedule  # share of the phase's
     returns: Returns
     learn_every: int  # steps
     learn_start: int  # transitions in the memory
@@ -139,6 +142,9 @@ class Trainer:
         self.best_step = -1
         self.last_report = ""  # of the latest evaluation
         self.last_metrics: dict[str, float] = {}  # of the latest evaluation
+        self._errors: list[
+            tuple[Sampler, npt.NDArray[np.int64], torch.Tensor]
+        ] = []  # of updates since the last feedback
 
     def run(self, stop: Stop = lambda: False) -> Outcome:
         """Train from where the counters stand; commits before it returns.
@@ -186,6 +192,7 @@ class Trainer:
         self._last_commit = time.monotonic()
 
     def state_dict(self) -> dict[str, Any]:
+        self._feed_back()  # the same as at the next update: nothing is drawn before
         return {
             "counters": asdict(self.counters),
             "learner": self.learner.state_dict(),
@@ -193,6 +200,7 @@ class Trainer:
             "stack": self.stack.state_dict(),
             "exploration": [generator.bit_generator.state for generator in self.exploration],
             "sampling": self.sampling.bit_generator.state,
+            "samplers": {str(index): phase.sampler.state_dict() for index, phase in enumerate(self.plan.phases)},
             "scores": self.scores,
             "lengths": self.lengths,
             "recent_scores": list(self.recent_scores),
@@ -214,6 +222,8 @@ class Trainer:
         for generator, generator_state in zip(self.exploration, state["exploration"], strict=True):
             generator.bit_generator.state = generator_state
         self.sampling.bit_generator.state = state["sampling"]
+        for index, phase in enumerate(self.plan.phases):
+            phase.sampler.load_state_dict(state["samplers"][str(index)])
         self.scores, self.lengths = state["scores"], state["lengths"]
         self.recent_scores.extend(state["recent_scores"])
         self.recent_lengths.extend(state["recent_lengths"])
@@ -243,7 +253,9 @@ class Trainer:
     def _iterate(self) -> None:
         """One step of every environment, and the updates that fall due."""
         overlap = self.emulators.num_envs > 1
-        self.learner.learning_rate = self.phase.learning_rate
+        self.learner.learning_rate = self.phase.learning_rate * self.plan.learning_rate(
+            self.done / self.plan.length, self.counters.steps
+        )
         decisions = self.actor.act(self.stack.state, self.epsilon, self.exploration)
         self.emulators.send(decisions.actions)
         if overlap:
@@ -259,9 +271,19 @@ class Trainer:
         self.counters.learn_ticks += due
         if len(self.memory) <= self.plan.learn_start:
             return
+        self._feed_back()
         for _ in range(due):
-            ids = self.phase.sampler.sample(self.memory, self.plan.batch_size, self.sampling)
-            self.learner.update(*self.memory.gather(ids, self.plan.returns))
+            sampler = self.phase.sampler
+            ids, weights = sampler.sample(self.memory, self.plan.batch_size, self.sampling)
+            errors = self.learner.update(*self.memory.gather(ids, self.plan.returns), weights)
+            if weights is not None:
+                self._errors.append((sampler, ids, errors))
+
+    def _feed_back(self) -> None:
+        """Tell the samplers the errors of the updates before; by now, the actor has waited for the device anyway."""
+        for sampler, ids, errors in self._errors:
+            sampler.feed_back(ids, errors.cpu().numpy())
+        self._errors.clear()
 
     def _observe(self, decisions: Decisions, steps: Steps) -> None:
         self.stack.push(steps.observations)
@@ -362,6 +384,7 @@ class Trainer:
         self.owes_evaluation = False
         metrics = evaluation.metrics()
         self.tracker.metrics(metrics, step)
+        self.tracker.tags({"policy": evaluation.policy})
         scores = [episode.score for episode in evaluation.episodes]
         title = f"evaluation, step {step:,}"
         self.tracker.image("evaluation/histogram", score_histogram(scores, title), step)

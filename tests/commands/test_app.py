@@ -74,9 +74,9 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("experiment=quik", "experiment=quik", "'quick'"),
     ("phase={}", "phase={}", "quick, single, steps, two_phase"),
     ("env=3", "env=3", "atlantis_v0"),
-    ("model=null", "model=None", "cnn, resnet"),
+    ("model=null", "model=None", "cnn, resnet, resnet_fast"),
     ("sampler@samplers.uniform=top", "sampler=top", "'top_half'"),
-    ("model.name=foo", "model.name=foo", "cnn, resnet"),
+    ("model.name=foo", "model.name=foo", "cnn, resnet, resnet_fast"),
     ("optimizer.name=adamax", "optimizer.name=adamax", "'adam"),
     ("objective.name=double", "objective.name=double", "'double_dqn'"),
     ("env.id=Pong-v0", "env.id=Pong-v0", "ALE/Atlantis-v5, Atlantis-v0"),
@@ -275,7 +275,7 @@ def test_every_option_of_every_group_goes_with_every_experiment(experiment: str)
     for turn in range(max(map(len, groups.values()))):
         chosen = {group: options[turn % len(options)] for group, options in groups.items()}
         config = composed(f"experiment={experiment}", *(f"{group}={option}" for group, option in chosen.items()))
-        named = {"model", "objective", "optimizer", "epsilon", "sampler", "tracking"}
+        named = {"model", "objective", "optimizer", "lr_schedule", "epsilon", "sampler", "tracking"}
         assert {group: getattr(config, group).name for group in named} == {group: chosen[group] for group in named}
 
 

@@ -515,3 +515,52 @@ def test_acting_follows_every_update_though_the_target_stays() -> None:
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
         expected = copy.deepcopy(learner.network).eval()(torch.from_numpy(states) / 255).float()
     np.testing.assert_array_equal(learner.q_values(states), expected.numpy())
+
+
+# Weights and errors
+
+
+def test_weights_count_in_the_loss_and_a_sample_of_weight_0_teaches_nothing() -> None:
+    weighted, twin = _learner(DQNCnn), _learner(DQNCnn)
+    batch = _batch(36)
+    weighted.update(*batch, np.array([0.5] * 6))
+    twin.objective = _Halved()
+    twin.update(*batch)
+    torch.testing.assert_close(weighted.network.state_dict(), twin.network.state_dict())
+    still = _learner(DQNCnn)
+    before = copy.deepcopy(still.network.state_dict())
+    still.optimizer = torch.optim.SGD(still.network.parameters(), lr=1.0)
+    still.update(*batch, np.zeros(6))
+    torch.testing.assert_close(still.network.state_dict(), before)
+
+
+class _Halved(DoubleDQN):
+    def losses(self, q: torch.Tensor, a_t: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        return super().losses(q, a_t, target) / 2
+
+
+def test_an_update_returns_how_far_each_value_was_off_its_target() -> None:
+    learner = _learner(DQNCnn)
+    s_t, a_t, r_t, s_tpm, _ = _batch(36)
+    q_BA = learner.q_values(s_t)
+    errors = learner.update(s_t, a_t, r_t, s_tpm, np.zeros(6, np.float32))
+    np.testing.assert_allclose(errors.numpy(), np.abs(r_t - q_BA[range(6), a_t]), rtol=1e-5)
+
+
+@pytest.mark.parametrize("scale", [1e-5, 1e-3, 1e-2, 1e-1, 10.0])
+def test_rmsprop_is_the_dqn_paper_s_within_30_percent(scale: float) -> None:
+    """Mnih et al. 2015: of gradients g summed over 32 samples, g / sqrt(E[g^2] - E[g]^2 + .01)."""
+    rng = np.random.default_rng(0)
+    parameter = torch.zeros(50, requires_grad=True)
+    optimizer = torch.optim.RMSprop([parameter], lr=1.0, alpha=0.95, eps=0.1 / 32, centered=True)
+    mean, square = np.zeros(50), np.zeros(50)
+    for _ in range(100):
+        gradient = scale * rng.normal(size=50)  # of the mean over the batch
+        before = parameter.detach().numpy().copy()
+        parameter.grad = torch.from_numpy(gradient.astype(np.float32))
+        optimizer.step()
+        summed = 32 * gradient
+        mean, square = 0.95 * mean + 0.05 * summed, 0.95 * square + 0.05 * summed**2
+        papers = -summed / np.sqrt(square - mean**2 + 0.01)
+        ratio = (parameter.detach().numpy() - before) / papers
+        assert np.all((ratio > 0.5**0.5 - 0.01) & (ratio < 1.01))

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from atlantis_exp.learning.objectives import DQN, DoubleDQN, Quantile, action_values
+from atlantis_exp.learning.objectives import DQN, DoubleDQN, Quantile, action_values, td_errors
 
 every_seed = given(seed=st.integers(0, 1000))
 
@@ -116,3 +116,10 @@ def test_the_value_of_an_action_is_the_mean_of_its_quantiles() -> None:
 
 def _huber(error: float) -> float:
     return error * error / 2 if abs(error) < 1 else abs(error) - 0.5
+
+
+def test_an_error_is_of_the_taken_action_s_value() -> None:
+    q_BA = torch.tensor([[1.0, 5.0], [2.0, 3.0]])
+    assert td_errors(q_BA, torch.tensor([1, 0]), torch.tensor([2.0, 2.5])).tolist() == [3.0, 0.5]
+    z_BAN = torch.tensor([[[0.0, 2.0], [4.0, 6.0]], [[1.0, 3.0], [3.0, 3.0]]])
+    assert td_errors(z_BAN, torch.tensor([1, 0]), torch.tensor([[1.0, 3.0], [5.0, 0.0]])).tolist() == [3.0, 0.5]

@@ -5,6 +5,7 @@ from torch import nn
 from atlantis_exp.networks.cnn import DQNCnn
 from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
 from atlantis_exp.networks.resnet import ResNetDQN
+from atlantis_exp.networks.resnet_fast import ResNetFast
 from atlantis_exp.networks.sizes import count_parameters
 
 
@@ -12,7 +13,7 @@ def quantile_head(features: int, num_actions: int) -> QuantileHead:
     return QuantileHead(features, num_actions, 7)
 
 
-@pytest.mark.parametrize("network_class", [DQNCnn, ResNetDQN])
+@pytest.mark.parametrize("network_class", [DQNCnn, ResNetDQN, ResNetFast])
 @pytest.mark.parametrize(
     ("head", "shape"),
     [(nn.Linear, (2, 4)), (DuelingHead, (2, 4)), (quantile_head, (2, 4, 7))],

@@ -41,6 +41,21 @@ def test_the_network_is_asked_once_and_only_about_states_that_chance_leaves_to_i
         asked.clear()
 
 
+def test_an_actor_that_watches_decides_the_same_and_says_where_chance_agrees() -> None:
+    states = STATES.copy()
+    states[:, 0, 0, 0] = [3, 0, 2, 1, 3]
+    streams, twins = generators(), generators()
+    for _ in range(20):
+        decisions = EpsilonGreedy(values_of, 4, watches=True).act(states, 0.5, streams)
+        expected = EpsilonGreedy(values_of, 4).act(states, 0.5, twins)
+        assert decisions.actions.tolist() == expected.actions.tolist()
+        assert decisions.random.tolist() == expected.random.tolist()
+        assert decisions.agrees is not None
+        assert decisions.agrees.tolist() == [
+            int(a) == s for a, s in zip(decisions.actions, [3, 0, 2, 1, 3], strict=True)
+        ]
+
+
 @pytest.mark.parametrize("epsilon", [0.05, 0.5])
 def test_chance_decides_with_probability_epsilon_and_then_takes_every_action_alike(epsilon: float) -> None:
     actor, streams = EpsilonGreedy(values_of, 4), generators()

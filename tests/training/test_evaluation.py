@@ -89,3 +89,54 @@ def test_the_actions_are_counted_by_who_chose_them() -> None:
         "interquartile range (450.0 -> 750.0) mean = 600.00\n\n"
         "high score: 900.0, rand: 50.0% neural net: 50.0%"
     )
+
+
+def test_what_the_policy_does_is_counted() -> None:
+    evaluation = Evaluation(
+        0.5,
+        [
+            Episode(1, 0.0, 12, False, bytearray([0, 1, 1, 3]), bytearray([1, 0, 0, 1]), bytearray([1, 1, 1, 0])),
+            Episode(2, 0.0, 12, False, bytearray([0, 1, 2, 1]), bytearray([1, 0, 1, 0]), bytearray([0, 1, 0, 1])),
+        ],
+    )
+    assert evaluation.chance_agreement == 1 / 4
+    assert evaluation.favourite == ("FIRE", 1.0)
+    assert evaluation.collapsed
+    metrics = evaluation.metrics()
+    shares = [2 / 8, 4 / 8, 1 / 8, 1 / 8]
+    assert metrics["actions/entropy"] == pytest.approx(-sum(share * np.log2(share) for share in shares))
+    assert (metrics["actions/favourite_share"], metrics["actions/random_equals_best"]) == (1.0, 0.25)
+    assert evaluation.policy == "collapsed: FIRE in 100.0% of the network's decisions"
+
+
+def test_a_policy_that_still_does_something_else_has_not_collapsed() -> None:
+    actions, chosen = bytearray([1] * 99 + [2]), bytearray(100)
+    evaluation = Evaluation(0.0, [Episode(1, 0.0, 12, False, actions, chosen)])
+    assert not evaluation.collapsed
+    assert evaluation.policy == "FIRE in 99.0% of the network's decisions"
+    assert evaluation.chance_agreement is None
+    assert "actions/random_equals_best" not in evaluation.metrics()
+
+
+def test_a_player_without_a_network_has_no_favourite(played: Callable[..., Evaluation]) -> None:
+    evaluation = played(1)
+    assert evaluation.favourite[1] == 0.0
+    assert not evaluation.collapsed
+
+
+def test_the_score_is_told_apart_by_gun_where_a_step_s_reward_is_one_hit_s(tiny: Compose) -> None:
+    env = tiny("env.workers=1", "env.max_steps=700").env
+    with build_emulators(env, 2) as emulators:
+        evaluation = evaluate(
+            RandomActor(4), emulators, episodes=2, epsilon=0.0, seed=5, size=env.size, stack=env.stack
+        )
+    emulator, totals = make_emulator(env)(), {"centre": 0.0, "side": 0.0}
+    for episode in evaluation.episodes:
+        emulator.reset(episode.seed)
+        rewards = [emulator.step(action).reward for action in episode.actions]
+        totals["centre"] += sum(reward for reward in rewards if reward in (100, 1_000))
+        totals["side"] += sum(reward for reward in rewards if reward in (200, 2_000))
+    assert min(totals.values()) > 0
+    metrics = evaluation.metrics()
+    for gun, total in totals.items():
+        assert metrics[f"evaluation/score_{gun}_gun"] == total / 2

@@ -1,20 +1,24 @@
 import dataclasses
+import io
 import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
+import torch
+from rich.console import Console
 
+from atlantis_exp.build import build_trainer
 from atlantis_exp.config import Config
 from atlantis_exp.game.vector import WorkerDied
 from atlantis_exp.replay.memory import ReplayMemory, Returns
-from atlantis_exp.replay.samplers import Sampler
-from atlantis_exp.tracking.journal import Metrics, read
+from atlantis_exp.replay.samplers import Draw, Sampler
+from atlantis_exp.tracking.journal import Journal, Metrics, Tags, read
 from atlantis_exp.training.actor import ConstantActor
 from atlantis_exp.training.fingerprint import fingerprint
+from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Diverged, Phase, Plan, Trainer
 
 Compose = Callable[..., Config]
@@ -80,7 +84,14 @@ def test_the_same_seed_gives_the_same_training_and_another_seed_another(
         ("model=cnn", "env.num_envs=1"),
         ("model=cnn", "env.num_envs=3", "env.workers=2", "objective=double_dqn"),
         ("model=resnet", "env.size=16", "env.num_envs=1", "optimizer=rmsprop", "objective.target.mode=train"),
-        ("objective=quantile", "objective.n_step=3", "objective.target.tau=1", "objective.target.every=3"),
+        ("env.num_envs=3", "env.workers=2", "sampler=prioritized", "phase.quick.sampler=prioritized"),
+        (
+            "objective=quantile",
+            "lr_schedule=one_cycle",
+            "objective.n_step=3",
+            "objective.target.tau=1",
+            "objective.target.every=3",
+        ),
         pytest.param(("model=resnet", "env.size=16", "env.num_envs=8", "env.workers=2"), marks=pytest.mark.slow),
         pytest.param(("model=cnn", "env.num_envs=8", "env=atlantis_standard", "env.size=40"), marks=pytest.mark.slow),
     ],
@@ -153,7 +164,10 @@ def test_learning_rate_and_sampler_change_with_the_phase_and_nothing_else_does(
         name: str
         sampler: Sampler
 
-        def sample(self, memory: ReplayMemory, count: int, rng: np.random.Generator) -> npt.NDArray[np.int64]:
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self.sampler, name)
+
+        def sample(self, memory: ReplayMemory, count: int, rng: np.random.Generator) -> Draw:
             tape.append((trainer.counters.steps, self.name, count, trainer.learner.learning_rate))
             return self.sampler.sample(memory, count, rng)
 
@@ -198,6 +212,65 @@ def test_updates_are_those_that_a_naive_loop_counts(
             if known > learn_start and (num_envs == 1 or known < 132):
                 naive.append(known)
     assert tape == naive
+
+
+@pytest.mark.parametrize("num_envs", [1, 8])
+def test_a_prioritized_training_is_the_same_whenever_it_is_committed(
+    tiny: Compose, started: Start, tmp_path: Path, num_envs: int
+) -> None:
+    """With eight environments several updates fall due at once, and the memory forgets what awaits its error."""
+    prints = []
+    for name, seconds in (("every-step", "1e-9"), ("at-the-end", "1e9")):
+        trainer = started(
+            tiny(
+                "sampler=prioritized",
+                f"env.num_envs={num_envs}",
+                "env.workers=1",
+                "replay.capacity=70",
+                "training.learn_every=2",
+                f"tracking.commit_seconds={seconds}",
+            ),
+            tmp_path / name,
+        )
+        trainer.run()
+        prints.append(print_of(trainer, tmp_path / name))
+    assert prints[0] == prints[1]
+
+
+def test_the_learning_rate_is_the_phase_s_times_the_schedule_s(tiny: Compose, started: Start, tmp_path: Path) -> None:
+    never = ("evaluation.every_steps=null", "evaluation.at_end=false")
+    trainer = started(tiny(*TWO_PHASES, *never, "lr_schedule=linear", "lr_schedule.duration=0.5"), tmp_path)
+    trainer.run()
+    expected = {step: (1e-3 if step <= 80 else 3e-4) * max(0.0, 1 - (step - 1) / 70) for step in range(20, 141, 20)}
+    assert dict(curve(tmp_path, "learning/learning_rate")) == pytest.approx(expected)
+
+
+def test_evaluations_amid_the_training_may_be_shorter_than_the_one_at_its_end(
+    tiny: Compose, started: Start, tmp_path: Path
+) -> None:
+    trainer = started(tiny("evaluation.interim_episodes=1"), tmp_path)
+    trainer.run()
+    assert curve(tmp_path, "evaluation/episodes") == [(80, 1), (160, 2)]
+
+
+def test_a_collapsed_policy_is_tagged_and_told(tiny: Compose, tmp_path: Path) -> None:
+    told = Console(record=True, file=io.StringIO(), width=200)
+    config = tiny("evaluation.every_steps=null", "evaluation.epsilon=0.0", "training.learn_start=110")
+    trainer = build_trainer(config, tmp_path, Journal(tmp_path), Progress(told))
+    with torch.no_grad():
+        for parameter in trainer.learner.network.parameters():
+            parameter.zero_()
+        list(trainer.learner.network.parameters())[-1][2] = 1.0
+        trainer.learner._q_online.refresh()
+    trainer.plan = dataclasses.replace(trainer.plan, learn_start=10**6)
+    trainer.run()
+    trainer.emulators.close()
+    policy = "collapsed: RIGHTFIRE in 100.0% of the network's decisions"
+    tags = {
+        key: value for _, record in read(tmp_path) if isinstance(record, Tags) for key, value in record.values.items()
+    }
+    assert tags["policy"] == policy
+    assert f"warning: the policy has {policy}" in told.export_text()
 
 
 def test_a_truncated_episode_bootstraps_and_a_terminated_one_does_not(
@@ -250,7 +323,7 @@ def test_a_plan_in_episodes_ends_with_its_last_episode(tiny: Compose, started: S
 
 def test_the_phase_at_a_boundary_is_the_one_that_begins_there() -> None:
     phases = [Phase("a", 2, 0.1, None), Phase("b", 1, 0.2, None)]  # type: ignore[arg-type]
-    plan = Plan("steps", phases, lambda *_: 0.0, Returns(0.9), 1, 0, 1)
+    plan = Plan("steps", phases, lambda *_: 0.0, lambda *_: 1.0, Returns(0.9), 1, 0, 1)
     assert [plan.phase_at(done).name for done in (0, 1, 2, 3, 9)] == ["a", "a", "b", "b", "b"]
 
 

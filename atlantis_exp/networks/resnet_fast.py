@@ -1,0 +1,68 @@
+"""The residual network that costs a tenth of the report's."""
+
+import torch
+from torch import nn
+
+from atlantis_exp.networks.heads import Head
+from atlantis_exp.networks.sizes import convolved
+
+
+class ResidualBlock(nn.Module):
+    """Two 3x3 convolutions beside an identity, without normalisation (Espeholt et al. 2018, figure 3)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.residual = nn.Sequential(
+            nn.SiLU(),
+            nn.Conv2d(channels, channels, kernel_size=3, padding=1),
+            nn.SiLU(),
+            nn.Conv2d(channels, channels, kernel_size=3, padding=1),
+        )
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        y: torch.Tensor = x + self.residual(x)
+        return y
+
+
+class ResNetFast(nn.Module):
+    """A residual network whose stem shrinks the sides at once: 0.20 GFLOP a sample of an update at 159x159.
+
+    ResNetDQN needs 1.87, most of it in a stem that works on 77x77. Here the stem is DQNCnn's first layer; two stages
+    follow, a convolution that halves the sides and a residual block each, then two dense layers. No batch statistics,
+    no dropout. Its 3.4 million parameters are 6.9 MB in half precision.
+
+    Input (B, C, H, W) in [0, 1], output that of the `head`, (B, num_actions) by default. It is made for H = W = 159;
+    the first dense layer follows from `input_shape` = (C, H, W). Raises ValueError if a side is below `smallest_side`.
+    """
+
+    smallest_side = 8  # pixels; 8 -> 1
+
+    def __init__(self, input_shape: tuple[int, int, int], num_actions: int, head: Head = nn.Linear) -> None:
+        super().__init__()
+        channels, height, width = input_shape
+        if min(height, width) < self.smallest_side:
+            raise ValueError(f"ResNetFast needs {self.smallest_side} pixels a side at least, not {height}x{width}")
+        self.features = nn.Sequential(  # 159x159
+            nn.Conv2d(channels, 16, kernel_size=8, stride=4),  # 38x38
+            nn.SiLU(),
+            nn.Conv2d(16, 32, kernel_size=3, stride=2, padding=1),  # 19x19
+            ResidualBlock(32),
+            nn.SiLU(),
+            nn.Conv2d(32, 64, kernel_size=3, stride=2, padding=1),  # 10x10
+            ResidualBlock(64),
+            nn.SiLU(),
+        )
+        self.fc = nn.Sequential(
+            nn.Linear(64 * _last_side(height) * _last_side(width), 512),
+            nn.SiLU(),
+            head(512, num_actions),
+        )
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        q: torch.Tensor = self.fc(self.features(x).flatten(1))
+        return q
+
+
+def _last_side(side: int) -> int:
+    side = convolved(side, kernel=8, stride=4)
+    return -(-side // 4)  # two convolutions halve it, rounding up
