@@ -220,10 +220,11 @@ def _key(override: Override) -> str:
 
 
 def _nearest_key(key: str, keys: set[str]) -> str:
-    """The nearest key of any depth; a bare name is also compared with the last parts, as `lr` with `optimizer.lr`."""
-    exact = sorted(known for known in keys if known.rsplit(".", 1)[-1] == key.rsplit(".", 1)[-1])
-    if exact:
-        return f"did you mean '{exact[0]}'?"
+    """The nearest key beside it, or of any depth; a bare name is also compared with the last parts, as `lr` with
+    `optimizer.lr`."""
     parent = key.rpartition(".")[0]
-    siblings = {known for known in keys if known.rpartition(".")[0] == parent}
-    return nearest(key, siblings if siblings and parent else keys)
+    siblings = {known for known in keys if parent and known.rpartition(".")[0] == parent}
+    exact = sorted(known for known in keys if known.rsplit(".", 1)[-1] == key.rsplit(".", 1)[-1])
+    if exact and not siblings:
+        return f"did you mean '{exact[0]}'?"
+    return nearest(key, siblings or keys)

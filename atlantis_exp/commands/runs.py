@@ -237,7 +237,7 @@ def record_evaluation(
     with folder.held(), published(folder, tracking, outputs) as journal:
         folder.write_config(facts)
         journal.params({key: str(value) for key, value in flatten(facts).items()})
-        journal.tags({**provenance(), "atlantis.kind": kind})
+        journal.tags({**provenance(), "atlantis.kind": kind, "policy": evaluation.policy})
         step = int(facts.get("step", 0))
         journal.metrics(evaluation.metrics(), step)
         for index, episode in enumerate(evaluation.episodes):

@@ -100,6 +100,8 @@ class Evaluation:
     def policy(self) -> str:
         """In words, what the network does most."""
         action, share = self.favourite
+        if not share:
+            return "chance alone"
         return f"{'collapsed: ' if self.collapsed else ''}{action} in {share:.1%} of the network's decisions"
 
     def metrics(self) -> dict[str, float]:

@@ -121,6 +121,7 @@ def test_a_policy_that_still_does_something_else_has_not_collapsed() -> None:
 def test_a_player_without_a_network_has_no_favourite(played: Callable[..., Evaluation]) -> None:
     evaluation = played(1)
     assert evaluation.favourite[1] == 0.0
+    assert evaluation.policy == "chance alone"
     assert not evaluation.collapsed
 
 
