@@ -11,6 +11,7 @@ import numpy as np
 import safetensors.torch
 import torch
 from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from atlantis_exp import config as cfg
 from atlantis_exp.faults import Fault
@@ -133,6 +134,18 @@ def build_learner(config: cfg.Config) -> Learner:
         precision=choose_precision(config.training.precision, device),  # type: ignore[arg-type]
         target_mode=target.mode,
     )
+
+
+def count_update_flops(config: cfg.Config) -> int:
+    """Floating-point operations of one update, two a multiply-add, in convolutions and matrix products alone.
+
+    Counted on a learner of its own: forward, backward and the objective's passes, whatever they are.
+    """
+    learner = build_learner(config)
+    states = np.zeros((2, config.env.stack, config.env.size, config.env.size), np.uint8)
+    with FlopCounterMode(display=False) as counter:
+        learner.update(states, np.zeros(2, np.int64), np.zeros(2), states, np.zeros(2, np.bool_))
+    return int(counter.get_total_flops() * config.training.batch_size // len(states))
 
 
 def build_plan(config: cfg.Config) -> Plan:
