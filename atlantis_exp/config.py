@@ -413,6 +413,20 @@ class ReportConfig:
     paths: PathsConfig
 
 
+@dataclass(config=_STRICT, kw_only=True, frozen=True)
+class CompareConfig:
+    """Finished runs as groups, and what tells them apart."""
+
+    by: list[str]  # config keys
+    runs: list[str]  # names, starts of names or patterns; none: all
+    where: list[str]  # KEY=VALUE; none: all
+    epsilon: Probability | None  # of the evaluations; null: each run's latest
+    resamples: Annotated[int, Field(ge=100, le=1_000_000)]  # bootstrap samples
+    seed: Annotated[int, Field(ge=0)]  # of the bootstrap
+    tracking: TrackingConfig
+    paths: PathsConfig
+
+
 def _check_env(env: EnvConfig) -> None:
     rows, columns = SCREEN
     up, right, down, left = env.crop

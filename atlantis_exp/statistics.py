@@ -81,9 +81,9 @@ def resample(seeds: Sequence[Scores], resamples: int, rng: np.random.Generator) 
     ]
 
 
-def interval(estimates: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def interval(estimates: Sequence[float] | Sequence[Scores] | Scores) -> npt.NDArray[np.float64]:
     """The middle 95 % of bootstrap estimates along their first axis, (2, ...): the percentile method."""
-    ends: npt.NDArray[np.float64] = np.percentile(estimates, (2.5, 97.5), axis=0)
+    ends: npt.NDArray[np.float64] = np.percentile(np.asarray(estimates), (2.5, 97.5), axis=0)
     return ends
 
 
@@ -105,20 +105,19 @@ class Difference:
     value: float
     low: float
     high: float
-    more_seeds: int | None  # in each group, until such a difference is decided; None where no number would do
+    more_seeds: int | None  # about, in each group, until it is decided; None where a thousand would not do
 
     @property
     def is_decided(self) -> bool:
-        """Whether the interval leaves out zero."""
-        return self.low > 0 or self.high < 0
+        """Whether there are seeds enough and the interval leaves out zero."""
+        return self.more_seeds == 0
 
 
 def difference(seeds: npt.ArrayLike, others: npt.ArrayLike) -> Difference:
     """Compare two groups by one value a seed (Welch 1947).
 
-    `more_seeds` is the fewest that both groups would have to be enlarged to, less the smaller group, for Welch's
-    interval to leave out zero if means and variances stayed as they are; at least `FEWEST_SEEDS` are asked for. None
-    where that is more than a thousand.
+    Decided needs `FEWEST_SEEDS` in each group and an interval without zero. `more_seeds` is the least n that is enough
+    for both when means and variances stay as they are, less the size of the smaller group.
     """
     groups = [np.asarray(values, np.float64) for values in (seeds, others)]
     value = float(groups[0].mean() - groups[1].mean())
@@ -127,11 +126,11 @@ def difference(seeds: npt.ArrayLike, others: npt.ArrayLike) -> Difference:
         return Difference(value, np.nan, np.nan, FEWEST_SEEDS - smaller)
     variances = [float(group.var(ddof=1)) for group in groups]
     half = _half_width(variances, [group.size for group in groups])
-    if abs(value) > half:
-        return Difference(value, value - half, value + half, 0)
-    enough = (n for n in range(smaller + 1, 1_000) if abs(value) > _half_width(variances, [n, n]))
-    needed = next(enough, None)
-    return Difference(value, value - half, value + half, None if needed is None else needed - smaller)
+    more: int | None = 0
+    if smaller < FEWEST_SEEDS or abs(value) <= half:
+        sizes = range(max(FEWEST_SEEDS, smaller + 1), 1_000)
+        more = next((n - smaller for n in sizes if abs(value) > _half_width(variances, [n, n])), None)
+    return Difference(value, value - half, value + half, more)
 
 
 def _half_width(variances: Sequence[float], sizes: Sequence[int]) -> float:

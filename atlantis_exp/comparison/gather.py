@@ -70,22 +70,16 @@ class _Unusable(ValueError):
     """A run that cannot be compared, and why."""
 
 
-def gather(
-    outputs: Path, runs: Sequence[str] = (), where: Sequence[str] = (), epsilon: float | None = None
-) -> Gathered:
-    """Read all finished runs under `outputs`, or those whose name fits a pattern and whose config holds all of `where`.
+def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None) -> Gathered:
+    """Read all finished runs under `outputs`, or those whose name begins with or fits one of the patterns `runs`.
 
     A training's episodes are those of its latest evaluation after its last step, be it the training's own or one that
     the verb `evaluate` made; given `epsilon`, of the latest at that epsilon.
-
-    Raises:
-        ConfigError: on a pattern or condition that is not readable or that fits no run.
     """
-    conditions = [_condition(text) for text in where]
     evaluations = _evaluations(outputs)
     gathered = Gathered()
     for folder in sorted(path for path in (outputs / "runs").glob("*") if path.is_dir()):
-        if runs and not any(fnmatchcase(folder.name, pattern) for pattern in runs):
+        if runs and not any(fnmatchcase(folder.name, f"{pattern}*") for pattern in runs):
             continue
         try:
             tree = _config(folder)
@@ -94,15 +88,24 @@ def gather(
                     Player(folder.name, flatten(tree), _episodes(folder / "artifacts/evaluation/episodes.csv"))
                 )
                 continue
-            config = parse(Config, tree)
-            leaves = flatten(to_dict(config))
-            if all(key in leaves and leaves[key] == value for key, value in _resolved(conditions, leaves)):
-                gathered.trainings.append(_training(folder, config, evaluations[folder.name], epsilon))
+            gathered.trainings.append(_training(folder, parse(Config, tree), evaluations[folder.name], epsilon))
         except _Unusable as error:
             gathered.skipped[folder.name] = str(error)
         except (ValueError, KeyError, OSError) as error:
             gathered.skipped[folder.name] = f"broken: {error}"
     return gathered
+
+
+def select(trainings: Iterable[Training], where: Sequence[str]) -> list[Training]:
+    """The trainings whose configs hold all of KEY=VALUE, with keys as `group` takes them. Raises: ConfigError."""
+    selected = list(trainings)
+    for text in where:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError(f"where={text}: write KEY=VALUE, as in where=model=cnn,seed=0")
+        _check_key("where", key, selected)
+        selected = [run for run in selected if value in _spellings(run.config.get(resolve(key, run.config)))]
+    return selected
 
 
 def group(trainings: Iterable[Training], by: Sequence[str]) -> dict[str, list[Training]]:
@@ -113,8 +116,7 @@ def group(trainings: Iterable[Training], by: Sequence[str]) -> dict[str, list[Tr
     """
     trainings = list(trainings)
     for key in by:
-        if not any(resolve(key, training.config) for training in trainings):
-            raise ConfigError(f"by={key}: no such key; {nearest(key, {k for t in trainings for k in t.config})}")
+        _check_key("by", key, trainings)
     groups = defaultdict(list)
     for training in trainings:
         parts = []
@@ -158,21 +160,14 @@ def plays_alike(player: Player, training: Training) -> bool:
     return all(player.config.get(key) == training.config[key] for key in keys)
 
 
-def _condition(text: str) -> tuple[str, Any]:
-    key, equals, value = text.partition("=")
-    if not key or not equals:
-        raise ConfigError(f"where={text}: write KEY=VALUE, as in where=model=cnn,seed=0")
-    try:
-        return key, json.loads(value)
-    except ValueError:
-        return key, value
+def _check_key(option: str, key: str, trainings: Sequence[Training]) -> None:
+    if trainings and not any(resolve(key, training.config) for training in trainings):
+        raise ConfigError(f"{option}={key}: no such key; {nearest(key, {k for run in trainings for k in run.config})}")
 
 
-def _resolved(conditions: Sequence[tuple[str, Any]], leaves: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    for key, _ in conditions:
-        if not resolve(key, leaves):
-            raise ConfigError(f"where={key}: no such key; {nearest(key, set(leaves))}")
-    return [(resolve(key, leaves), value) for key, value in conditions]
+def _spellings(value: Any) -> tuple[str, str]:
+    """How a person may write a value: as Python and as YAML print it."""
+    return str(value), json.dumps(value)
 
 
 def _config(folder: Path) -> dict[str, Any]:

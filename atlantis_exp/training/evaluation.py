@@ -110,7 +110,9 @@ class Evaluation:
         for index, episode in enumerate(self.episodes):
             counts = episode.action_counts
             ends = (episode.steps, episode.frames, int(episode.truncated), sum(episode.random))
-            writer.writerow((index, episode.seed, episode.score, *ends, *counts.sum(1).tolist(), *counts[:, 1].tolist()))
+            writer.writerow(
+                (index, episode.seed, episode.score, *ends, *counts.sum(1).tolist(), *counts[:, 1].tolist())
+            )
         return text.getvalue()
 
     def report(self) -> str:
