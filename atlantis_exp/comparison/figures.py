@@ -96,11 +96,11 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
     return drawn
 
 
-def _render(plot: Callable[["Axes"], None], title: str, alt: str, height: float = 3.6) -> Drawn:
+def _render(plot: Callable[["Axes"], None], title: str, alt: str, height: float = 3.2) -> Drawn:
     with _style():
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(6.4, height), layout="constrained")
+        figure = Figure(figsize=(4.8, height), layout="constrained")
         plot(figure.add_subplot())
         return Drawn(title, alt, _png(figure), _svg(figure, alt))
 
@@ -146,12 +146,17 @@ def _thousands(axis: Any) -> None:
     axis.set_major_formatter(EngFormatter(sep=""))
 
 
+def _legend(axes: "Axes", columns: int = 2) -> None:
+    if axes.get_legend_handles_labels()[0]:
+        axes.get_figure(root=True).legend(loc="outside upper left", ncols=columns, fontsize=8, columnspacing=1)
+
+
 def _reference_lines(draw_line: Callable[..., Any], comparison: Comparison, low: float, high: float) -> None:
-    """The players' scores as grey lines, those that lie within a factor of four of what is drawn."""
+    """The players' scores as grey lines, those that lie within a factor of two of what is drawn."""
     references = comparison.tables["references"]
-    shown = [row for row in references if row["kind"] == "player" and low / 4 <= row["score"] <= high * 4]
-    has_own = random_line(references)["protocol"].startswith("published") is False
-    shown = [row for row in shown if not (has_own and row["name"] == "random player")]
+    shown = [row for row in references if row["kind"] == "player" and low / 2 <= row["score"] <= high * 2]
+    if not random_line(references)["protocol"].startswith("published"):
+        shown = [row for row in shown if row["name"] != "random player"]
     styles = ((0, (1, 1)), (0, (4, 2)), (0, (6, 2, 1, 2)), (0, (2, 3)))
     for index, row in enumerate(shown):
         label = f"{row['name']}{', published' if 'published' in row['protocol'] else ''} ({row['score']:,.0f})"
@@ -178,9 +183,10 @@ def _learning(axes: "Axes", comparison: Comparison, axis: str, rows: Table) -> N
     axes.set_ylim(0, None)
     axes.set_xlabel(_UNITS[axis])
     axes.set_ylabel("training score, mean of 100")
-    _thousands(axes.xaxis)
+    if axis != "hours":
+        _thousands(axes.xaxis)
     _thousands(axes.yaxis)
-    axes.legend(fontsize=8)
+    _legend(axes)
 
 
 def _evaluation(axes: "Axes", comparison: Comparison) -> None:
@@ -207,8 +213,7 @@ def _evaluation(axes: "Axes", comparison: Comparison) -> None:
     axes.set_ylim(len(table) - 0.4, -0.6)
     axes.set_xlabel("score")
     _thousands(axes.xaxis)
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12 - 0.3 / (1 + len(table))), ncols=2)
+    _legend(axes)
 
 
 def _distribution(axes: "Axes", comparison: Comparison) -> None:
@@ -225,7 +230,7 @@ def _distribution(axes: "Axes", comparison: Comparison) -> None:
     axes.set_xlabel("score")
     axes.set_ylabel("share of episodes")
     _thousands(axes.xaxis)
-    axes.legend(fontsize=8)
+    _legend(axes)
 
 
 def _profile(axes: "Axes", comparison: Comparison) -> None:
@@ -240,7 +245,7 @@ def _profile(axes: "Axes", comparison: Comparison) -> None:
     axes.set_xlabel("score (logarithmic)")
     axes.set_ylabel("share of episodes above")
     axes.set_ylim(0, 1.03)
-    axes.legend(fontsize=8)
+    _legend(axes)
 
 
 def _actions(axes: "Axes", comparison: Comparison) -> None:
@@ -260,7 +265,7 @@ def _actions(axes: "Axes", comparison: Comparison) -> None:
     axes.set_xlim(0, 1)
     axes.xaxis.set_major_formatter("{x:.0%}")
     axes.set_xlabel("share of steps in evaluation (hatched: chosen by chance)")
-    axes.figure.legend(loc="outside upper center", ncols=4, fontsize=8)
+    _legend(axes, columns=4)
 
 
 def _references(axes: "Axes", comparison: Comparison) -> None:

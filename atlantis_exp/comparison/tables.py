@@ -304,7 +304,7 @@ def _verdict(views: Table, groups: Groups) -> str:
     for view in fair:
         sides[view["leader"]].append(f"{view['view']}{'' if view['decided'] else ' (not decided)'}")
     if sides:
-        said += "; in training " + ", ".join(f"{label} leads at {' and '.join(at)}" for label, at in sides.items())
+        said += "; in training " + " and ".join(f"{label} leads at {', '.join(at)}" for label, at in sides.items())
     return said + "."
 
 
