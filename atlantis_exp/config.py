@@ -420,7 +420,7 @@ class CompareConfig:
     by: list[str]  # config keys
     runs: list[str]  # names, starts of names or patterns; none: all
     where: list[str]  # KEY=VALUE; none: all
-    epsilon: Probability | None  # of the evaluations; null: each run's latest
+    at_epsilon: Probability | None  # of the evaluations; null: each run's latest
     resamples: Annotated[int, Field(ge=100, le=1_000_000)]  # bootstrap samples
     seed: Annotated[int, Field(ge=0)]  # of the bootstrap
     tracking: TrackingConfig

@@ -29,7 +29,7 @@ def compare(config: CompareConfig) -> None:
     from atlantis_exp.comparison.report import page
 
     outputs = Path(config.paths.outputs)
-    gathered = gather(outputs, config.runs, config.epsilon)
+    gathered = gather(outputs, config.runs, config.at_epsilon)
     for name, reason in gathered.skipped.items():
         print(f"atlantis_exp: left out {name}: {reason}", file=sys.stderr)
     trainings = select(gathered.trainings, config.where)

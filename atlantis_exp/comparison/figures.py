@@ -148,7 +148,7 @@ def _thousands(axis: Any) -> None:
 
 def _legend(axes: "Axes", columns: int = 2) -> None:
     if axes.get_legend_handles_labels()[0]:
-        axes.get_figure(root=True).legend(loc="outside upper left", ncols=columns, fontsize=8, columnspacing=1)
+        axes.figure.legend(loc="outside upper left", ncols=columns, fontsize=8, columnspacing=1)
 
 
 def _reference_lines(draw_line: Callable[..., Any], comparison: Comparison, low: float, high: float) -> None:
@@ -183,6 +183,7 @@ def _learning(axes: "Axes", comparison: Comparison, axis: str, rows: Table) -> N
     axes.set_ylim(0, None)
     axes.set_xlabel(_UNITS[axis])
     axes.set_ylabel("training score, mean of 100")
+    axes.locator_params(axis="x", nbins=5)
     if axis != "hours":
         _thousands(axes.xaxis)
     _thousands(axes.yaxis)
@@ -264,7 +265,7 @@ def _actions(axes: "Axes", comparison: Comparison) -> None:
     axes.set_ylim(len(comparison.groups) - 0.4, -0.6)
     axes.set_xlim(0, 1)
     axes.xaxis.set_major_formatter("{x:.0%}")
-    axes.set_xlabel("share of steps in evaluation (hatched: chosen by chance)")
+    axes.set_xlabel("share of steps (hatched: by chance)")
     _legend(axes, columns=4)
 
 

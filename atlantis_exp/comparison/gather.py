@@ -91,7 +91,7 @@ def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None
             gathered.trainings.append(_training(folder, parse(Config, tree), evaluations[folder.name], epsilon))
         except _Unusable as error:
             gathered.skipped[folder.name] = str(error)
-        except (ValueError, KeyError, OSError) as error:
+        except (ValueError, KeyError, TypeError, OSError) as error:
             gathered.skipped[folder.name] = f"broken: {error}"
     return gathered
 
@@ -124,7 +124,7 @@ def group(trainings: Iterable[Training], by: Sequence[str]) -> dict[str, list[Tr
             name = resolve(key, training.config)
             value = training.config.get(name)
             parts.append(value if isinstance(value, str) else f"{name.rsplit('.')[-1] or key}={json.dumps(value)}")
-        groups[", ".join(parts) or "all"].append(training)
+        groups[" ".join(parts) or "all"].append(training)
     return dict(sorted(groups.items()))
 
 
@@ -147,7 +147,7 @@ def refuse_mixed_protocols(trainings: Sequence[Training], by: Sequence[str]) -> 
                 for value, names in holders.items()
             )
             hint = (
-                "epsilon=VALUE takes evaluations at that one, `evaluate run=NAME epsilon=VALUE` makes them"
+                "at_epsilon=VALUE takes evaluations at that one, `evaluate run=NAME epsilon=VALUE` makes them"
                 if key == "evaluation.epsilon"
                 else f"choose with runs= or where=, or ask for it with by={key}"
             )

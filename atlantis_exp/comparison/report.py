@@ -86,6 +86,8 @@ def cells(name: str, row: Row) -> list[tuple[str, bool]]:
 
 def number(value: object, column: str = "") -> str:
     """A table's value as a person reads it."""
+    if value is None:
+        return "over 1,000"  # of seeds
     if isinstance(value, bool):
         return "yes" if value else "no"
     if not isinstance(value, int | float):

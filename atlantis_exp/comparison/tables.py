@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from itertools import permutations
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -153,7 +153,7 @@ def _run(label: str, training: Training) -> Row:
 
 def _improvement(groups: Groups, samples: Mapping[str, Sequence[Scores]]) -> Table:
     table = []
-    for one, other in permutations(groups, 2):
+    for one, other in combinations(groups, 2):
         estimates = [probability_of_improvement(*pair) for pair in zip(samples[one], samples[other], strict=True)]
         low, high = interval(estimates)
         probability = probability_of_improvement(_pooled(groups[one]), _pooled(groups[other]))
@@ -278,7 +278,7 @@ def _view(name: str, at: float | str, values: Mapping[str, Sequence[float]]) -> 
         "low": found.low,
         "high": found.high,
         "decided": found.is_decided,
-        "more_seeds": "" if found.more_seeds is None else found.more_seeds,
+        "more_seeds": found.more_seeds,
     }
 
 
@@ -293,7 +293,7 @@ def _verdict(views: Table, groups: Groups) -> str:
     gap = f"{main['difference']:,.0f} points of evaluation IQM ({known}{sizes} runs)"
     if main["decided"]:
         said = f"{main['leader']} plays better than {main['other']}, by {gap}"
-    elif main["more_seeds"] == "":
+    elif main["more_seeds"] is None:
         said = f"Not decided: {main['leader']} is ahead of {main['other']} by {gap}, too little for any number of seeds"
     else:
         said = (
@@ -338,12 +338,11 @@ def _notes(
     missing = [name for name in AXES.values() if views and name not in shown]
     if missing:
         notes.append(f"No verdict at {' and '.join(missing)}: a run has no such learning curve, or one too short.")
-    for row in evaluation:
-        if row["time_cap_share"] > 0:
-            notes.append(
-                f"{row['time_cap_share']:.0%} of the episodes of {row['group']} reached the time cap, which decides "
-                f"their scores; look at the score per 1,000 steps."
-            )
+    if capped := [f"{row['time_cap_share']:.0%} of {row['group']}" for row in evaluation if row["time_cap_share"] > 0]:
+        notes.append(
+            f"The time cap ended episodes and so decides their scores: {', '.join(capped)}; "
+            f"look at the score per 1,000 steps."
+        )
     for runs in groups.values():
         notes += [
             f"{run.name} scored {_HELD:,.0f} in every episode, as any one action does that is held: it has collapsed."

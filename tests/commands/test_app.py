@@ -16,6 +16,7 @@ from atlantis_exp.commands import VERBS
 from atlantis_exp.commands.app import CONF, check, checked
 from atlantis_exp.config import (
     BaselineConfig,
+    CompareConfig,
     Config,
     ConfigError,
     EvaluateConfig,
@@ -31,6 +32,7 @@ SCHEMAS: dict[str, type[Any]] = {
     "config": Config,
     "evaluate": EvaluateConfig,
     "baseline": BaselineConfig,
+    "compare": CompareConfig,
     "query": QueryConfig,
     "report": ReportConfig,
     "ui": UiConfig,
