@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import safetensors.torch
 import torch
 from torch import nn
@@ -28,7 +29,7 @@ from atlantis_exp.networks.resnet import ResNetDQN
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.replay.samplers import Sampler, TopHalfSampler, UniformSampler
 from atlantis_exp.tracking.journal import Tracker
-from atlantis_exp.training.actor import Actor, ConstantActor, EpsilonGreedy, RandomActor
+from atlantis_exp.training.actor import Actor, ConstantActor, EpsilonGreedy, PersonActor, RandomActor
 from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate, replay
 from atlantis_exp.training.forecast import Forecast, forecast
@@ -174,8 +175,9 @@ def run_evaluation(
     evaluation: cfg.EvaluationConfig,
     progress: Progress,
     stop: Callable[[], bool] = lambda: False,
+    emulators: Emulators | None = None,
 ) -> tuple[Evaluation, bytes | None]:
-    """Evaluate an actor on emulators of its own; with the film of the best episode where the config asks for it.
+    """Evaluate an actor on emulators made for it; with the film of the best episode where the config asks for it.
 
     Raises:
         Stopped: when `stop` says so.
@@ -187,7 +189,7 @@ def run_evaluation(
         played += 1
         progress.evaluated_episode(played, evaluation.episodes, episode)
 
-    with build_emulators(env, min(evaluation.num_envs, evaluation.episodes)) as emulators:
+    with emulators or build_emulators(env, min(evaluation.num_envs, evaluation.episodes)) as emulators:
         result = evaluate(
             actor,
             emulators,
@@ -241,6 +243,12 @@ def build_forecast(config: cfg.Config, steps_done: int) -> Forecast:
             max_steps=config.budget.steps,
             evaluations_an_episode=1 / (config.evaluation.every_episodes or float("inf")),
         )
+
+
+def build_person(env: cfg.EnvConfig, choose: Callable[[npt.NDArray[np.uint8]], int]) -> tuple[PersonActor, Emulators]:
+    """A person at the keyboard, and the one emulator whose screen they see."""
+    emulator = make_emulator(env)()
+    return PersonActor(emulator.screen_rgb, choose), make_emulators(lambda: emulator, 1, 1)
 
 
 def build_baseline(agent: cfg.BaselineAgentConfig) -> Actor:

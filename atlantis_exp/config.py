@@ -389,6 +389,21 @@ class BaselineConfig:
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
+class PlayConfig:
+    """A tracked run of a person."""
+
+    player: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")]
+    scale: Annotated[int, Field(ge=1, le=10)]  # window pixels a screen pixel
+    env: EnvConfig
+    evaluation: EvaluationConfig
+    tracking: TrackingConfig
+    paths: PathsConfig
+
+    def __post_init__(self) -> None:
+        _check_env(self.env)
+
+
+@dataclass(config=_STRICT, kw_only=True, frozen=True)
 class QueryConfig:
     """The environment query of report figures 1.1 to 1.3."""
 

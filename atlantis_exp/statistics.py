@@ -13,6 +13,7 @@ Scores = npt.NDArray[np.float64]
 FEWEST_SEEDS = 3  # a group, below which no spread is to be trusted
 RANDOM_SCORE = 12_850.0  # of the random player, as published; Quan and Ostrovski, dqn_zoo/atari_data.py
 HUMAN_SCORE = 29_028.1  # of the professional tester; the same table
+EARLY_FRAMES = 10_000_000  # of training, up to which published DQN stays below the random player or near it
 
 
 @dataclass(frozen=True)

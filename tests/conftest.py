@@ -79,7 +79,7 @@ def recorded(tiny: Callable[..., Config]) -> Callable[..., Path]:
             journal.tags({"flops_per_update": str(flops)})
         for frames, hours, updates, score in curve:
             point = {"throughput/frames": frames, "throughput/hours": hours, "learning/updates": updates}
-            journal.metrics({**point, "score/mean_100": score}, int(frames) // 3)
+            journal.metrics({**point, "score/mean_100": score, "actions/epsilon": 0.5}, int(frames) // 3)
         episodes = [
             Episode(index, score, 12, index < truncated, bytearray([0, 1, 2, 3]), bytearray([0, 0, 0, 1]))
             for index, score in enumerate(scores)

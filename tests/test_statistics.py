@@ -178,7 +178,7 @@ def test_the_missing_seeds_are_the_fewest_that_would_decide() -> None:
     assert found.more_seeds is not None
 
     def half(n: int) -> float:  # of the interval of two groups of n with these variances, 300^2 each
-        return float(scipy.stats.t.ppf(0.975, 2 * n - 2)) * 300 * (2 / n) ** 0.5
+        return float(scipy.stats.t.ppf(0.975, 2 * n - 2) * 300 * np.sqrt(2 / n))
 
     needed = 3 + found.more_seeds
     assert half(needed) < found.value <= half(needed - 1)

@@ -59,6 +59,13 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
                 f"Training score, mean of 100 episodes, by {_UNITS[axis]}; at the end of the shortest run: "
                 + _said(groups, rows, "score"),
             )
+            if axis == "frames":
+                drawn["exploration"] = _render(
+                    partial(_exploration, comparison=comparison, rows=rows),
+                    "Exploration while training",
+                    "Epsilon by emulator frames of training, as in report figure 4.1; at the end: "
+                    + _said(groups, rows, "epsilon", ".3f"),
+                )
     drawn["evaluation"] = _render(
         partial(_evaluation, comparison=comparison),
         "Evaluation after the last step",
@@ -130,9 +137,9 @@ def _svg(figure: "Figure", alt: str) -> str:
     return svg.replace("<svg", f'<svg role="img" aria-label="{escape(alt)}"', 1)
 
 
-def _said(groups: Sequence[str], rows: Table, column: str) -> str:
+def _said(groups: Sequence[str], rows: Table, column: str, style: str = ",.0f") -> str:
     last = {row["group"]: row[column] for row in rows}
-    return ", ".join(f"{group} {last[group]:,.0f}" for group in groups if group in last)
+    return ", ".join(f"{group} {last[group]:{style}}" for group in groups if group in last)
 
 
 def _look(groups: Sequence[str], group: str) -> dict[str, Any]:
@@ -187,6 +194,20 @@ def _learning(axes: "Axes", comparison: Comparison, axis: str, rows: Table) -> N
     if axis != "hours":
         _thousands(axes.xaxis)
     _thousands(axes.yaxis)
+    _legend(axes)
+
+
+def _exploration(axes: "Axes", comparison: Comparison, rows: Table) -> None:
+    for group in comparison.groups:
+        own = [row for row in rows if row["group"] == group]
+        axes.plot(
+            *([row[key] for row in own] for key in ("x", "epsilon")), label=group, **_look(comparison.groups, group)
+        )
+    axes.set_ylim(0, 1)
+    axes.set_xlabel(_UNITS["frames"])
+    axes.set_ylabel("epsilon")
+    axes.locator_params(axis="x", nbins=5)
+    _thousands(axes.xaxis)
     _legend(axes)
 
 

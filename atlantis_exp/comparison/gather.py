@@ -44,7 +44,7 @@ class Training:
     name: str
     config: dict[str, Any]  # dotted keys; `evaluation.epsilon` is that of the evaluation taken
     science: dict[str, Any]  # the dotted keys that decide its numbers
-    curve: dict[str, Array]  # frames, hours, flops (where recorded) and score, the mean of the last 100 episodes
+    curve: dict[str, Array]  # frames, hours, flops (where recorded), epsilon, score (mean of the last 100 episodes)
     episodes: Episodes
 
 
@@ -198,6 +198,7 @@ def _training(
                 ("frames", "throughput/frames"),
                 ("hours", "throughput/hours"),
                 ("updates", "learning/updates"),
+                ("epsilon", "actions/epsilon"),
                 ("score", "score/mean_100"),
             ):
                 curve[name].append(record.values[metric])

@@ -14,6 +14,7 @@ import numpy as np
 
 from atlantis_exp.comparison.gather import Array, Gathered, Player, Training, plays_alike, resolve
 from atlantis_exp.statistics import (
+    EARLY_FRAMES,
     FEWEST_SEEDS,
     RANDOM_SCORE,
     Scores,
@@ -33,7 +34,6 @@ AXES = {"frames": "equal frames", "hours": "equal hours", "flops": "equal gradie
 """The three fair views: column of a learning curve to what is equal."""
 
 _GRID = 100  # points of a curve
-_EARLY = 10_000_000  # frames, up to which published DQN stays below the random player
 _HELD = 2_000.0  # what any one action scores when it is held
 
 
@@ -171,18 +171,19 @@ def _curve(axis: str, label: str, runs: Sequence[Training], rng: np.random.Gener
         return []
     grid = np.linspace(first, last, _GRID)
     scores = np.array([_at(training, axis, grid) for training in runs])
+    epsilons = np.mean([_at(training, axis, grid, "epsilon") for training in runs], axis=0)
     drawn = rng.integers(len(runs), size=(2_000, len(runs)))
     low, high = interval(scores[drawn].mean(axis=1))
     return [
-        {"axis": axis, "group": label, "x": x, "score": score, "low": under, "high": over}
-        for x, score, under, over in zip(
-            grid.tolist(), scores.mean(axis=0).tolist(), low.tolist(), high.tolist(), strict=True
-        )
+        {"axis": axis, "group": label, "x": x, "score": score, "low": under, "high": over, "epsilon": epsilon}
+        for x, score, under, over, epsilon in np.stack(
+            (grid, scores.mean(axis=0), low, high, epsilons), axis=1
+        ).tolist()
     ]
 
 
-def _at(training: Training, axis: str, x: float | Array) -> Array:
-    return np.asarray(np.interp(x, training.curve[axis], training.curve["score"]), np.float64)
+def _at(training: Training, axis: str, x: float | Array, measure: str = "score") -> Array:
+    return np.asarray(np.interp(x, training.curve[axis], training.curve[measure]), np.float64)
 
 
 def _profile(groups: Groups, samples: Mapping[str, Sequence[Scores]]) -> Table:
@@ -355,7 +356,7 @@ def _notes(
             "No random player was measured under these settings, so a published one stands for it; "
             "python -m atlantis_exp baseline with the same env measures one."
         )
-    if frames <= _EARLY and any(row["iqm"] < measured["score"] for row in evaluation):
+    if frames <= EARLY_FRAMES and any(row["iqm"] < measured["score"] for row in evaluation):
         notes.append(early_dqn())
     return notes
 

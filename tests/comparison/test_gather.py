@@ -43,6 +43,7 @@ def test_a_run_is_read_from_its_journal_its_table_and_its_config(recorded: Recor
         "frames": [3, 6],
         "hours": [0.1, 0.3],
         "flops": [0, 2_000],
+        "epsilon": [0.5, 0.5],
         "score": [50, 70],
     }
     assert run.episodes.scores.tolist() == [300, 100]
@@ -108,7 +109,7 @@ def test_the_latest_evaluation_after_the_last_step_counts_and_epsilon_chooses_am
 
 def test_a_run_without_flops_has_no_such_curve(recorded: Recorded, tmp_path: Path) -> None:
     recorded(flops=None)
-    assert set(gather(tmp_path).trainings[0].curve) == {"frames", "hours", "score"}
+    assert set(gather(tmp_path).trainings[0].curve) == {"frames", "hours", "epsilon", "score"}
 
 
 def test_groups_are_made_by_any_config_key(recorded: Recorded, tmp_path: Path) -> None:

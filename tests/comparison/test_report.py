@@ -61,7 +61,7 @@ def test_the_page_is_whole_fetches_nothing_and_is_made_for_phones_and_both_colou
     assert ("meta", {"name": "viewport", "content": "width=device-width, initial-scale=1"}) in tags.found
     assert "@media (prefers-color-scheme: dark)" in text
     pictures = [attributes for tag, attributes in tags.found if tag == "svg"]
-    assert len(pictures) == 8
+    assert len(pictures) == 9
     assert all(attributes["role"] == "img" and attributes["aria-label"] for attributes in pictures)
     ids = [attributes["id"] for _, attributes in tags.found if attributes.get("id")]
     referred = {(attributes.get("xlink:href") or "#")[1:] for tag, attributes in tags.found if tag == "use"}
@@ -109,7 +109,7 @@ def test_numbers_are_written_for_people(value: object, column: str, text: str) -
 def test_figures_are_pictures_of_something_and_take_on_the_pages_ink(comparison: Comparison) -> None:
     figures = draw(comparison)
     assert list(figures) == [
-        *("learning_frames", "learning_hours", "learning_flops"),
+        *("learning_frames", "exploration", "learning_hours", "learning_flops"),
         *("evaluation", "distribution", "profile", "actions", "references"),
     ]
     for figure in figures.values():

@@ -144,6 +144,7 @@ def test_a_curve_is_the_mean_over_runs_as_far_as_all_of_them_go(recorded: Record
     assert (frames[0]["x"], frames[-1]["x"]) == (0, 100)
     assert (frames[0]["score"], frames[-1]["score"]) == (150, 200)
     assert (frames[-1]["low"], frames[-1]["high"]) == (100, 300)
+    assert {row["epsilon"] for row in rows} == {0.5}
 
 
 def test_the_profile_is_the_share_of_episodes_above_a_score(compared: Callable[..., Comparison]) -> None:
