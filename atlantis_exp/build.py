@@ -8,9 +8,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import safetensors.torch
 import torch
 from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from atlantis_exp import config as cfg
 from atlantis_exp.faults import Fault
@@ -36,7 +38,7 @@ from atlantis_exp.networks.resnet_fast import ResNetFast
 from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.replay.samplers import PrioritizedSampler, Sampler, TopHalfSampler, UniformSampler
 from atlantis_exp.tracking.journal import Tracker
-from atlantis_exp.training.actor import Actor, ConstantActor, EpsilonGreedy, RandomActor
+from atlantis_exp.training.actor import Actor, ConstantActor, EpsilonGreedy, PersonActor, RandomActor
 from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate, replay
 from atlantis_exp.training.forecast import Forecast, forecast
@@ -173,6 +175,20 @@ def build_schedule(schedule: cfg.EpsilonConfig | cfg.LrScheduleConfig) -> Schedu
     return built
 
 
+def count_update_flops(config: cfg.Config) -> int:
+    """Floating-point operations of one update, two a multiply-add, in convolutions and matrix products alone.
+
+    Counted on a learner of its own: forward, backward and the objective's passes, whatever they are.
+    """
+    threads = torch.get_num_threads()
+    learner = build_learner(dataclasses.replace(config, threads=1))  # the counter sees this thread alone
+    states = np.zeros((2, config.env.stack, config.env.size, config.env.size), np.uint8)
+    with FlopCounterMode(display=False) as counter:
+        learner.update(states, np.zeros(2, np.int64), np.zeros(2), states, np.zeros(2))
+    torch.set_num_threads(threads)
+    return int(counter.get_total_flops() * config.training.batch_size // len(states))
+
+
 def build_plan(config: cfg.Config) -> Plan:
     """Phases, schedules and learning cadence."""
     objective = config.objective
@@ -201,8 +217,9 @@ def run_evaluation(
     episodes: int,
     progress: Progress,
     stop: Callable[[], bool] = lambda: False,
+    emulators: Emulators | None = None,
 ) -> tuple[Evaluation, bytes | None]:
-    """Evaluate an actor on emulators of its own; with the film of the best episode where the config asks for it.
+    """Evaluate an actor on emulators made for it; with the film of the best episode where the config asks for it.
 
     Raises:
         Stopped: when `stop` says so.
@@ -214,7 +231,7 @@ def run_evaluation(
         played += 1
         progress.evaluated_episode(played, episodes, episode)
 
-    with build_emulators(env, min(evaluation.num_envs, episodes)) as emulators:
+    with emulators or build_emulators(env, min(evaluation.num_envs, episodes)) as emulators:
         result = evaluate(
             actor,
             emulators,
@@ -268,6 +285,12 @@ def build_forecast(config: cfg.Config, steps_done: int) -> Forecast:
             max_steps=config.budget.steps,
             evaluations_an_episode=1 / (config.evaluation.every_episodes or float("inf")),
         )
+
+
+def build_person(env: cfg.EnvConfig, choose: Callable[[npt.NDArray[np.uint8]], int]) -> tuple[PersonActor, Emulators]:
+    """A person at the keyboard, and the one emulator whose screen they see."""
+    emulator = make_emulator(env)()
+    return PersonActor(emulator.screen_rgb, choose), make_emulators(lambda: emulator, 1, 1)
 
 
 def build_baseline(agent: cfg.BaselineAgentConfig) -> Actor:

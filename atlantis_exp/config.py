@@ -462,6 +462,21 @@ class BaselineConfig:
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
+class PlayConfig:
+    """A tracked run of a person."""
+
+    player: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")]
+    scale: Annotated[int, Field(ge=1, le=10)]  # window pixels a screen pixel
+    env: EnvConfig
+    evaluation: EvaluationConfig
+    tracking: TrackingConfig
+    paths: PathsConfig
+
+    def __post_init__(self) -> None:
+        _check_env(self.env)
+
+
+@dataclass(config=_STRICT, kw_only=True, frozen=True)
 class QueryConfig:
     """The environment query of report figures 1.1 to 1.3."""
 
@@ -483,6 +498,20 @@ class UiConfig:
 class ReportConfig:
     """The table of what a store holds."""
 
+    paths: PathsConfig
+
+
+@dataclass(config=_STRICT, kw_only=True, frozen=True)
+class CompareConfig:
+    """Finished runs as groups, and what tells them apart."""
+
+    by: list[str]  # config keys
+    runs: list[str]  # names, starts of names or patterns; none: all
+    where: list[str]  # KEY=VALUE; none: all
+    at_epsilon: Probability | None  # of the evaluations; null: each run's latest
+    resamples: Annotated[int, Field(ge=100, le=1_000_000)]  # bootstrap samples
+    seed: Annotated[int, Field(ge=0)]  # of the bootstrap
+    tracking: TrackingConfig
     paths: PathsConfig
 
 

@@ -38,7 +38,7 @@ class Case(NamedTuple):
 CASES = tuple(Case(*network, precision) for network in (("cnn", 128), ("resnet", 32)) for precision in ("bf16", "fp32"))
 
 
-def update_of(case: Case, *overrides: str) -> Callable[[], None]:
+def update_of(case: Case, *overrides: str) -> Callable[[], object]:
     """An update of a learner on a batch of noise; sets torch's threads to what the learner has in a training."""
     config = composed(f"model={case.model}", f"training.precision={case.precision}", *overrides)
     learner = build_learner(config)
@@ -54,7 +54,7 @@ def update_of(case: Case, *overrides: str) -> Callable[[], None]:
     )
 
 
-def flops_of(update: Callable[[], None]) -> int:
+def flops_of(update: Callable[[], object]) -> int:
     """Floating point operations of the matrix products and convolutions that a call makes in this thread."""
     with FlopCounterMode(display=False) as counter:
         update()
@@ -89,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     turns: dict[str, Callable[[], float]] = {}
     flops: dict[str, int] = {}
 
-    def measured(call: Callable[[], None], threads: int) -> Callable[[], float]:
+    def measured(call: Callable[[], object], threads: int) -> Callable[[], float]:
         def turn() -> float:
             torch.set_num_threads(threads)
             return calls_per_second(call, args.seconds)

@@ -1,16 +1,22 @@
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hypothesis import settings
 from rich.console import Console
 
 from atlantis_exp.build import build_trainer
 from atlantis_exp.commands.app import CONF, checked
-from atlantis_exp.config import Config
+from atlantis_exp.commands.runs import Result, RunFolder
+from atlantis_exp.config import Config, to_dict
 from atlantis_exp.tracking.journal import Journal
+from atlantis_exp.training.evaluation import Episode, Evaluation
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Trainer
+
+settings.register_profile("untimed", deadline=None)  # a busy machine is no failure
+settings.load_profile("untimed")
 
 TINY = (  # everything that a training can do, in seconds
     *("experiment=quick", "device=cpu", "threads=1", "tracking=none", "tracking.every_steps=20", "budget.forecast=off"),
@@ -52,3 +58,42 @@ def started() -> Iterator[Callable[[Config, Path], Trainer]]:
     yield trainer_of
     for trainer in trainers:
         trainer.emulators.close()
+
+
+@pytest.fixture
+def recorded(tiny: Callable[..., Config]) -> Callable[..., Path]:
+    """Writes the folder of a finished training without training it.
+
+    scores are its evaluation's; curve holds (frames, hours, updates, mean score) a point.
+    """
+
+    def record(
+        *overrides: str,
+        scores: Sequence[float] = (1_000.0, 2_000.0, 3_000.0, 4_000.0),
+        curve: Sequence[tuple[float, float, float, float]] = ((0, 0, 0, 1_000), (600, 0.5, 30, 2_000)),
+        flops: int | None = 100,
+        truncated: int = 0,
+        steps: int = 160,
+    ) -> Path:
+        config = tiny(*overrides)
+        folder = RunFolder(Path(config.paths.outputs) / "runs" / config.run_name())
+        journal = Journal(folder.path)
+        folder.write_config(to_dict(config))
+        if flops is not None:
+            journal.tags({"flops_per_update": str(flops)})
+        for frames, hours, updates, score in curve:
+            point = {"throughput/frames": frames, "throughput/hours": hours, "learning/updates": updates}
+            journal.metrics({**point, "score/mean_100": score, "actions/epsilon": 0.5}, int(frames) // 3)
+        episodes = [
+            Episode(index, score, 12, index < truncated, bytearray([0, 1, 2, 3]), bytearray([0, 0, 0, 1]))
+            for index, score in enumerate(scores)
+        ]
+        evaluation = Evaluation(config.evaluation.epsilon, episodes)
+        journal.artifact(f"evaluation/{steps:09d}.csv", evaluation.table().encode())
+        journal.state_dict()
+        journal.commit()
+        journal.status("FINISHED")
+        folder.write_result(Result("finished", steps, {}, evaluation.metrics(), evaluation.report()))
+        return folder.path
+
+    return record

@@ -1,7 +1,11 @@
 """Summaries against scipy, rliable and a naive oracle."""
 
 import statistics
+import sys
+from importlib.util import find_spec
 from random import Random
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +14,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rliable import metrics
 
-from atlantis_exp.statistics import summarize
+from atlantis_exp.statistics import (
+    HUMAN_SCORE,
+    RANDOM_SCORE,
+    Scores,
+    difference,
+    human_normalised,
+    interquartile_mean,
+    interval,
+    probability_of_improvement,
+    resample,
+    summarize,
+)
 
 SCORES = st.lists(st.integers(0, 50_000).map(lambda hundreds: 100.0 * hundreds), min_size=1, max_size=130)
 
@@ -61,3 +76,132 @@ def test_a_single_score_has_no_spread() -> None:
 def test_no_score_is_no_summary() -> None:
     with pytest.raises(ValueError, match="at least one"):
         summarize([])
+
+
+@pytest.fixture
+def library(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """rliable's bootstrap, which needs that of arch alone: arch as a whole does not import beside pandas 3."""
+    spec = find_spec("arch")
+    assert spec is not None
+    arch = ModuleType("arch")
+    arch.__path__ = list(spec.submodule_search_locations or ())
+    monkeypatch.setitem(sys.modules, "arch", arch)
+    from rliable import library
+
+    return library
+
+
+def column(scores: Scores) -> Scores:
+    """Scores as rliable takes them: runs by tasks, one task."""
+    return scores[:, np.newaxis]
+
+
+@given(SCORES, SCORES)
+def test_the_probability_of_improvement_is_rliables_and_the_share_of_won_pairs(
+    scores: list[float], others: list[float]
+) -> None:
+    x, y = np.array(scores), np.array(others)
+    ours = probability_of_improvement(x, y)
+    won = sum((a > b) + (a == b) / 2 for a in scores for b in others)
+    assert ours == pytest.approx(won / (len(scores) * len(others)), rel=1e-12)
+    assert ours == pytest.approx(1 - probability_of_improvement(y, x))
+    if len(set(scores + others)) > 1:  # scipy has no U where all are tied
+        assert ours == metrics.probability_of_improvement(column(x), column(y))
+
+
+def test_intervals_are_rliables_to_the_digit_when_the_same_samples_are_drawn(library: Any) -> None:
+    scores = np.random.default_rng(3).gamma(2, 4_000, 60).round(-2)
+    np.random.seed(5)  # noqa: NPY002 - rliable draws from the global generator
+    drawn = [data[0][:, 0] for (data, _) in library.StratifiedBootstrap(column(scores)).bootstrap(500)]
+    for statistic, theirs in (
+        (interquartile_mean, metrics.aggregate_iqm),
+        (lambda sample: float(np.mean(sample)), metrics.aggregate_mean),
+    ):
+        np.random.seed(5)  # noqa: NPY002
+        _, ends = library.get_interval_estimates(
+            {"a": column(scores)}, lambda x, theirs=theirs: np.array([theirs(x)]), reps=500
+        )
+        assert interval([statistic(sample) for sample in drawn]) == pytest.approx(ends["a"][:, 0], rel=1e-14)
+
+
+def test_a_resample_draws_whole_seeds_and_then_their_episodes() -> None:
+    seeds = [np.arange(10.0), np.arange(100.0, 110.0), np.arange(200.0, 210.0)]
+    samples = resample(seeds, 400, np.random.default_rng(0))
+    for sample in samples:
+        assert sample.size == 30
+        parts = sample.reshape(3, 10)
+        assert all(len(set(part // 100)) == 1 for part in parts)
+        assert set(sample) <= {*np.concatenate(seeds)}
+    hundreds = [tuple(sorted(sample.reshape(3, 10)[:, 0] // 100)) for sample in samples]
+    assert 0.15 < np.mean([len(set(drawn)) == 3 for drawn in hundreds]) < 0.3  # 3! / 3^3 = 0.222
+    assert all(len(set(sample.reshape(3, 10)[0])) < 10 for sample in samples[:20])  # episodes come again too
+
+
+def test_with_one_seed_a_resample_is_rliables_of_its_episodes(library: Any) -> None:
+    scores = np.random.default_rng(1).gamma(2, 4_000, 200)
+    ours = interval([float(s.mean()) for s in resample([scores], 4_000, np.random.default_rng(0))])
+    _, theirs = library.get_interval_estimates(
+        {"a": column(scores)}, lambda x: np.array([metrics.aggregate_mean(x)]), reps=4_000
+    )
+    assert ours == pytest.approx(theirs["a"][:, 0], rel=0.02)
+
+
+def test_seeds_that_differ_widen_the_interval_that_episodes_alone_would_give() -> None:
+    rng = np.random.default_rng(0)
+    seeds = [rng.normal(level, 10, 50) for level in (1_000, 2_000, 3_000)]
+    low, high = interval([float(sample.mean()) for sample in resample(seeds, 1_000, rng)])
+    low_pooled, high_pooled = interval([float(s.mean()) for s in resample([np.concatenate(seeds)], 1_000, rng)])
+    assert high - low > 3 * (high_pooled - low_pooled)
+
+
+def test_a_bootstrap_of_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one seed"):
+        resample([], 10, np.random.default_rng(0))
+
+
+VALUES = st.lists(st.floats(-1e6, 1e6).map(lambda value: round(value, 1)), min_size=2, max_size=8)
+
+
+@given(VALUES, VALUES)
+def test_a_difference_is_scipys_welch(seeds: list[float], others: list[float]) -> None:
+    found = difference(seeds, others)
+    assert found.value == pytest.approx(np.mean(seeds) - np.mean(others), abs=1e-6)
+    if min(np.var(seeds), np.var(others)) > 1e-3:
+        theirs = scipy.stats.ttest_ind(seeds, others, equal_var=False).confidence_interval(0.95)
+        assert (found.low, found.high) == pytest.approx((theirs.low, theirs.high), rel=1e-9, abs=1e-4)
+
+
+def test_the_missing_seeds_are_the_fewest_that_would_decide() -> None:
+    seeds, others = np.array([900.0, 1_200.0, 1_500.0]), np.array([600.0, 900.0, 1_200.0])
+    found = difference(seeds, others)
+    assert not found.is_decided
+    assert found.more_seeds is not None
+
+    def half(n: int) -> float:  # of the interval of two groups of n with these variances, 300^2 each
+        return float(scipy.stats.t.ppf(0.975, 2 * n - 2) * 300 * np.sqrt(2 / n))
+
+    needed = 3 + found.more_seeds
+    assert half(needed) < found.value <= half(needed - 1)
+
+
+@pytest.mark.parametrize(
+    ("seeds", "others", "more"),
+    [
+        ([9.0], [1.0], 2),  # one seed says nothing of the next
+        ([9.0, 9.0, 9.0], [1.0], 2),
+        ([9.0, 9.1], [1.0, 1.1], 1),  # apart, but two seeds are too few
+        ([9.0, 9.1, 9.2], [1.0, 1.1, 1.2], 0),
+        ([2_000.0] * 3, [1_000.0] * 3, 0),
+        ([2_000.0] * 3, [2_000.0] * 3, None),
+        ([1.0, 1e6, 2e6], [2.0, 1e6, 2e6], None),
+    ],
+)
+def test_decided_needs_three_seeds_each_and_an_interval_without_zero(
+    seeds: list[float], others: list[float], more: int | None
+) -> None:
+    assert difference(seeds, others).more_seeds == more
+
+
+def test_human_normalised_is_zero_for_the_random_player_and_one_for_the_human() -> None:
+    assert (human_normalised(RANDOM_SCORE), human_normalised(HUMAN_SCORE)) == (0, 1)
+    assert human_normalised(85_641.0) == pytest.approx(4.499, abs=1e-3)  # 449.9 % in Mnih et al. 2015

@@ -7,6 +7,8 @@ VERBS = {
     "train": "one run, from a composed config; the same command again continues or reports it (the default verb)",
     "evaluate": "a stored run's network, played again: run=NAME epsilon=0.05",
     "baseline": "a player without a network as a tracked run: agent=random, agent=constant",
+    "play": "a person at the keyboard as a tracked run: player=NAME",
+    "compare": "finished runs as groups: intervals, a verdict, a page of figures: by=model,sampler",
     "query": "what the environment is, and what this config makes of it",
     "verify-resume": "proves, for any training, that killing and continuing it changes no bit",
     "report": "the results that the outputs folder holds, as a table",

@@ -104,7 +104,7 @@ def _goes_on(config: Config, result: "Result") -> bool:
 
 
 def _train(config: Config, folder: "RunFolder") -> None:
-    from atlantis_exp.build import build_trainer
+    from atlantis_exp.build import build_trainer, count_update_flops
     from atlantis_exp.commands.runs import Result, provenance, published
     from atlantis_exp.game.vector import WorkerDied
     from atlantis_exp.tracking.journal import JournalError
@@ -127,6 +127,7 @@ def _train(config: Config, folder: "RunFolder") -> None:
             else:
                 journal.params({key: str(value) for key, value in flatten(to_dict(config)).items()})
                 journal.artifact("config.json", (folder.path / "config.json").read_bytes())
+                journal.tags({"flops_per_update": str(count_update_flops(config))})
                 progress.say(f"starting run {folder.name} in {folder.path}")
             journal.tags({**provenance(), **_facts(trainer), "atlantis.kind": "training"})
             journal.status("RUNNING")

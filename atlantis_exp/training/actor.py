@@ -62,6 +62,17 @@ class RandomActor:
 
 
 @dataclass(frozen=True)
+class PersonActor:
+    """Whoever `choose`s an action at the sight of the one emulator's screen, (210, 160, 3) uint8."""
+
+    screen: Callable[[], npt.NDArray[np.uint8]]
+    choose: Callable[[npt.NDArray[np.uint8]], int]
+
+    def act(self, states: States, epsilon: float, generators: Generators) -> Decisions:  # noqa: ARG002
+        return Decisions(np.array([self.choose(self.screen())], np.int64), np.zeros(1, np.bool_))
+
+
+@dataclass(frozen=True)
 class ConstantActor:
     """Always the same action, whatever epsilon says: in Atlantis a held button fires once."""
 

@@ -48,6 +48,13 @@ class Episode:
         """Share of the decisions that chance took."""
         return sum(self.random) / self.steps
 
+    @property
+    def action_counts(self) -> npt.NDArray[np.int64]:
+        """How often each action was chosen, (actions, 2): by the network, by chance."""
+        counts = np.zeros((len(ACTIONS), 2), np.int64)
+        np.add.at(counts, (np.frombuffer(self.actions, np.uint8), np.frombuffer(self.random, np.uint8)), 1)
+        return counts
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -68,10 +75,8 @@ class Evaluation:
 
     @cached_property
     def action_counts(self) -> npt.NDArray[np.int64]:
-        """How often each action was chosen, (actions, 2): by the network, by chance."""
-        counts = np.zeros((len(ACTIONS), 2), np.int64)
-        for episode in self.episodes:
-            np.add.at(counts, (np.frombuffer(episode.actions, np.uint8), np.frombuffer(episode.random, np.uint8)), 1)
+        """Those of all episodes together, (actions, 2): by the network, by chance."""
+        counts: npt.NDArray[np.int64] = np.sum([episode.action_counts for episode in self.episodes], axis=0)
         return counts
 
     @property
@@ -137,14 +142,17 @@ class Evaluation:
         }
 
     def table(self) -> str:
-        """A CSV line an episode."""
+        """A CSV line an episode, with its steps by action, and those of them that chance chose."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(("episode", "seed", "score", "steps", "frames", "truncated", "random", *ACTIONS))
+        by_chance = [f"{action}_random" for action in ACTIONS]
+        writer.writerow(("episode", "seed", "score", "steps", "frames", "truncated", "random", *ACTIONS, *by_chance))
         for index, episode in enumerate(self.episodes):
-            counts = np.bincount(np.frombuffer(episode.actions, np.uint8), minlength=len(ACTIONS))
+            counts = episode.action_counts
             ends = (episode.steps, episode.frames, int(episode.truncated), sum(episode.random))
-            writer.writerow((index, episode.seed, episode.score, *ends, *counts.tolist()))
+            writer.writerow(
+                (index, episode.seed, episode.score, *ends, *counts.sum(1).tolist(), *counts[:, 1].tolist())
+            )
         return text.getvalue()
 
     def report(self) -> str:

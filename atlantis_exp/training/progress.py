@@ -10,6 +10,8 @@ from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
+from atlantis_exp.statistics import EARLY_FRAMES, RANDOM_SCORE
+
 if TYPE_CHECKING:
     from atlantis_exp.training.evaluation import Episode, Evaluation
     from atlantis_exp.training.trainer import Trainer
@@ -68,6 +70,11 @@ class Progress:
         )
         if evaluation.collapsed:
             self.say(f"warning: the policy has {evaluation.policy}; any one action, held, scores 2,000")
+        if summary.mean < RANDOM_SCORE and trainer.counters.frames <= EARLY_FRAMES:
+            self.say(
+                f"  below the published random player's {RANDOM_SCORE:,.0f}, which is normal here: "
+                f"at 5 M frames published DQN is at 7,000 to 9,000 (docs/comparison.md)"
+            )
 
     def close(self) -> None:
         """End the bar."""

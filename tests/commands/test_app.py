@@ -16,9 +16,11 @@ from atlantis_exp.commands import VERBS
 from atlantis_exp.commands.app import CONF, check, checked
 from atlantis_exp.config import (
     BaselineConfig,
+    CompareConfig,
     Config,
     ConfigError,
     EvaluateConfig,
+    PlayConfig,
     QueryConfig,
     ReportConfig,
     UiConfig,
@@ -31,6 +33,8 @@ SCHEMAS: dict[str, type[Any]] = {
     "config": Config,
     "evaluate": EvaluateConfig,
     "baseline": BaselineConfig,
+    "compare": CompareConfig,
+    "play": PlayConfig,
     "query": QueryConfig,
     "report": ReportConfig,
     "ui": UiConfig,

@@ -58,8 +58,8 @@ def test_the_quantile_targets_are_the_target_network_s_of_its_action_with_the_be
 def test_nothing_comes_through_a_cut_bootstrap(objective: DQN | Quantile, shape: tuple[int, ...]) -> None:
     wild = torch.full(shape, torch.inf)
     targets = objective.targets(torch.tensor([1.0, 2.0]), wild, torch.tensor([0.0, 0.9]), lambda s: s, lambda s: -s)
-    assert targets[0].unique().tolist() == [1.0]
-    assert targets[1].unique().tolist() == [-torch.inf]
+    assert (targets[0] == 1.0).all()
+    assert (targets[1] == -torch.inf).all()
 
 
 @every_seed
@@ -103,7 +103,7 @@ def test_the_quantile_loss_is_least_at_the_quantiles() -> None:
         target_1N = torch.from_numpy(rng.uniform(0, 100, (64, 4)).astype(np.float32))
         loss = Quantile().losses(z_11N.expand(64, 1, 4), torch.zeros(64, dtype=torch.int64), target_1N).mean()
         optimizer.zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
     np.testing.assert_allclose(z_11N.detach().flatten(), [12.5, 37.5, 62.5, 87.5], atol=4)
 

@@ -152,7 +152,8 @@ def test_prioritized_draws_are_a_naive_sampler_s(
         expected, expected_weights = naive.sample(memory, count, copy.deepcopy(state))
         ids, weights = sampler.sample(memory, count, state)
         assert ids.tolist() == expected
-        np.testing.assert_allclose(weights, expected_weights, rtol=1e-6)
+        assert weights is not None
+        np.testing.assert_allclose(weights.tolist(), expected_weights, rtol=1e-6)
         # A transition that was drawn twice has one error.
         errors = (np.arange(16) % 5 * 0.7).astype(np.float32)[ids % 16]
         sampler.feed_back(ids, errors)

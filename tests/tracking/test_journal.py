@@ -83,7 +83,7 @@ def test_what_is_committed_is_read_back_in_its_order(tmp_path: Path, clock: Call
     ]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.dictionaries(st.from_regex(r"[a-z]{1,9}", fullmatch=True), st.floats(), min_size=1))
 def test_every_float_survives_the_journal(values: dict[str, float]) -> None:
     with TemporaryDirectory() as folder:
@@ -119,7 +119,6 @@ def test_a_status_reveals_no_record(tmp_path: Path) -> None:
     assert (commit.status, commit.offset, records(tmp_path)) == ("FAILED", 0, [])
 
 
-@settings(deadline=None)
 @given(st.lists(st.sampled_from(["step", "state", "save", "commit", "crash"]), max_size=40))
 def test_a_run_that_crashes_anywhere_shows_each_step_of_its_checkpoint_once(events: list[str]) -> None:
     with TemporaryDirectory() as name:

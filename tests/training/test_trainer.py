@@ -201,7 +201,12 @@ def test_updates_are_those_that_a_naive_loop_counts(
     )
     trainer = started(config, tmp_path)
     tape = []
-    trainer.learner.update = lambda *_: tape.append(len(trainer.memory))  # type: ignore[method-assign]
+
+    def update(*_: object) -> torch.Tensor:
+        tape.append(len(trainer.memory))
+        return torch.zeros(1)
+
+    trainer.learner.update = update  # type: ignore[method-assign, assignment]
     trainer.run()
 
     naive = []
@@ -261,7 +266,7 @@ def test_a_collapsed_policy_is_tagged_and_told(tiny: Compose, tmp_path: Path) ->
         for parameter in trainer.learner.network.parameters():
             parameter.zero_()
         list(trainer.learner.network.parameters())[-1][2] = 1.0
-        trainer.learner._q_online.refresh()
+        trainer.learner._online.refresh()
     trainer.plan = dataclasses.replace(trainer.plan, learn_start=10**6)
     trainer.run()
     trainer.emulators.close()

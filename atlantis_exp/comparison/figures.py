@@ -1,0 +1,312 @@
+"""Tables to figures: Okabe and Ito's colours, and a line style a group, so that no colour is needed to tell."""
+
+import io
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from atlantis_exp.comparison.tables import AXES, Comparison, Table, random_line
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # Okabe and Ito 2008
+_LINES = ("-", "--", "-.", ":")
+_INK = "#24292f"  # of text and axes; a page lets it follow its own
+_STYLE = {
+    **dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), _INK),
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "atlantis_exp",
+}
+_UNITS = {
+    "frames": "emulator frames of training",
+    "hours": "hours of training, evaluations included",
+    "flops": "floating-point operations of gradient updates",
+}
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure as a picture of its own and as a part of a page, whose colour of text it takes on."""
+
+    title: str
+    alt: str  # what it shows, in words
+    png: bytes
+    svg: str
+
+
+def draw(comparison: Comparison) -> dict[str, Drawn]:
+    """All figures of a comparison by name; one without data is left out."""
+    tables, groups = comparison.tables, comparison.groups
+    drawn: dict[str, Drawn] = {}
+    for axis, view in AXES.items():
+        if rows := [row for row in tables["curves"] if row["axis"] == axis]:
+            drawn[f"learning_{axis}"] = _render(
+                partial(_learning, comparison=comparison, axis=axis, rows=rows),
+                f"Learning at {view}",
+                f"Training score, mean of 100 episodes, by {_UNITS[axis]}; at the end of the shortest run: "
+                + _said(groups, rows, "score"),
+            )
+            if axis == "frames":
+                drawn["exploration"] = _render(
+                    partial(_exploration, comparison=comparison, rows=rows),
+                    "Exploration while training",
+                    "Epsilon by emulator frames of training, as in report figure 4.1; at the end: "
+                    + _said(groups, rows, "epsilon", ".3f"),
+                )
+    drawn["evaluation"] = _render(
+        partial(_evaluation, comparison=comparison),
+        "Evaluation after the last step",
+        "Interquartile mean, mean and median with 95 % intervals; interquartile means: "
+        + _said(groups, tables["evaluation"], "iqm"),
+        height=1.2 + 0.75 * len(groups),
+    )
+    drawn["distribution"] = _render(
+        partial(_distribution, comparison=comparison),
+        "Distribution of the evaluated scores",
+        "Histogram of evaluated scores, one step line a group; medians: "
+        + _said(groups, tables["evaluation"], "median"),
+    )
+    drawn["profile"] = _render(
+        partial(_profile, comparison=comparison),
+        "Share of episodes above a score",
+        "Performance profile: for each score the share of episodes that exceed it, with 95 % bands.",
+    )
+    drawn["actions"] = _render(
+        partial(_actions, comparison=comparison),
+        "Who chose which action",
+        "Share of each action in evaluation, split into network and chance; all actions of chance: "
+        + "; ".join(
+            f"{group} {sum(row['random'] for row in tables['actions'] if row['group'] == group):.1%}"
+            for group in groups
+        ),
+        height=1.2 + 0.6 * len(groups),
+    )
+    drawn["references"] = _render(
+        partial(_references, comparison=comparison),
+        "Beside other players",
+        "Mean scores of the groups among measured players and published algorithms, on a logarithmic axis.",
+        height=1.0 + 0.24 * (len(groups) + len(tables["references"])),
+    )
+    return drawn
+
+
+def _render(plot: Callable[["Axes"], None], title: str, alt: str, height: float = 3.2) -> Drawn:
+    with _style():
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(4.8, height), layout="constrained")
+        plot(figure.add_subplot())
+        return Drawn(title, alt, _png(figure), _svg(figure, alt))
+
+
+@contextmanager
+def _style() -> Iterator[None]:
+    from matplotlib import rc_context
+
+    with rc_context(_STYLE):  # type: ignore[arg-type]
+        yield
+
+
+def _png(figure: "Figure") -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=150, facecolor="white")
+    return buffer.getvalue()
+
+
+def _svg(figure: "Figure", alt: str) -> str:
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    svg = buffer.getvalue()[buffer.getvalue().index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r' id="[a-z]+[a-z0-9]*_[0-9]+"', "", svg)  # groups; what is referred to is named by a hash
+    svg = re.sub(r' (width|height)="[0-9.]+pt"', "", svg, count=2)
+    svg = svg.replace(_INK, "currentColor").replace("'DejaVu Sans', ", "")
+    return svg.replace("<svg", f'<svg role="img" aria-label="{escape(alt)}"', 1)
+
+
+def _said(groups: Sequence[str], rows: Table, column: str, style: str = ",.0f") -> str:
+    last = {row["group"]: row[column] for row in rows}
+    return ", ".join(f"{group} {last[group]:{style}}" for group in groups if group in last)
+
+
+def _look(groups: Sequence[str], group: str) -> dict[str, Any]:
+    index = groups.index(group)
+    return {"color": _COLOURS[index % len(_COLOURS)], "linestyle": _LINES[index % len(_LINES)]}
+
+
+def _thousands(axis: Any) -> None:
+    from matplotlib.ticker import EngFormatter
+
+    axis.set_major_formatter(EngFormatter(sep=""))
+
+
+def _legend(axes: "Axes", columns: int = 2) -> None:
+    if axes.get_legend_handles_labels()[0]:
+        axes.figure.legend(loc="outside upper left", ncols=columns, fontsize=8, columnspacing=1)
+
+
+def _reference_lines(draw_line: Callable[..., Any], comparison: Comparison, low: float, high: float) -> None:
+    """The players' scores as grey lines, those that lie within a factor of two of what is drawn."""
+    references = comparison.tables["references"]
+    shown = [row for row in references if row["kind"] == "player" and low / 2 <= row["score"] <= high * 2]
+    if not random_line(references)["protocol"].startswith("published"):
+        shown = [row for row in shown if row["name"] != "random player"]
+    styles = ((0, (1, 1)), (0, (4, 2)), (0, (6, 2, 1, 2)), (0, (2, 3)))
+    for index, row in enumerate(shown):
+        label = f"{row['name']}{', published' if 'published' in row['protocol'] else ''} ({row['score']:,.0f})"
+        draw_line(row["score"], color="#8c8c8c", linewidth=1, linestyle=styles[index % len(styles)], label=label)
+
+
+def _learning(axes: "Axes", comparison: Comparison, axis: str, rows: Table) -> None:
+    for group in comparison.groups:
+        own = [row for row in rows if row["group"] == group]
+        x, score, low, high = ([row[key] for row in own] for key in ("x", "score", "low", "high"))
+        look = _look(comparison.groups, group)
+        axes.plot(x, score, label=group, **look)
+        axes.fill_between(x, low, high, color=look["color"], alpha=0.2, linewidth=0)
+    if axis == "frames":
+        curves = defaultdict(list)
+        for row in comparison.tables["published_curves"]:
+            curves[row["name"]].append((row["frames"], row["mean"]))
+        for name, points in curves.items():
+            axes.plot(
+                *zip(*points, strict=True), color="#8c8c8c", marker=".", linewidth=0.8, label=f"{name}, published"
+            )
+    scores = [row[key] for row in rows for key in ("low", "high")]
+    _reference_lines(axes.axhline, comparison, min(scores), max(scores))
+    axes.set_ylim(0, None)
+    axes.set_xlabel(_UNITS[axis])
+    axes.set_ylabel("training score, mean of 100")
+    axes.locator_params(axis="x", nbins=5)
+    if axis != "hours":
+        _thousands(axes.xaxis)
+    _thousands(axes.yaxis)
+    _legend(axes)
+
+
+def _exploration(axes: "Axes", comparison: Comparison, rows: Table) -> None:
+    for group in comparison.groups:
+        own = [row for row in rows if row["group"] == group]
+        axes.plot(
+            *([row[key] for row in own] for key in ("x", "epsilon")), label=group, **_look(comparison.groups, group)
+        )
+    axes.set_ylim(0, 1)
+    axes.set_xlabel(_UNITS["frames"])
+    axes.set_ylabel("epsilon")
+    axes.locator_params(axis="x", nbins=5)
+    _thousands(axes.xaxis)
+    _legend(axes)
+
+
+def _evaluation(axes: "Axes", comparison: Comparison) -> None:
+    table = comparison.tables["evaluation"]
+    for index, row in enumerate(table):
+        for offset, (statistic, marker) in enumerate((("iqm", "o"), ("mean", "s"), ("median", "D"))):
+            y = index + 0.22 * (offset - 1)
+            low, high = row[f"{statistic}_low"], row[f"{statistic}_high"]
+            look = _look(comparison.groups, row["group"])["color"]
+            axes.plot([low, high], [y, y], color=look, linewidth=3, alpha=0.45, solid_capstyle="butt")
+            axes.plot(row[statistic], y, marker, color=look, markersize=6)
+            axes.annotate(
+                f"{'IQM' if statistic == 'iqm' else statistic} {row[statistic]:,.0f}",
+                (high, y),
+                xytext=(6, 0),
+                textcoords="offset points",
+                va="center",
+                fontsize=8,
+            )
+    ends = [row[f"{name}_{end}"] for row in table for name in ("iqm", "mean", "median") for end in ("low", "high")]
+    _reference_lines(axes.axvline, comparison, min(ends), max(ends))
+    axes.margins(x=0.15)
+    axes.set_yticks(range(len(table)), [row["group"] for row in table])
+    axes.set_ylim(len(table) - 0.4, -0.6)
+    axes.set_xlabel("score")
+    _thousands(axes.xaxis)
+    _legend(axes)
+
+
+def _distribution(axes: "Axes", comparison: Comparison) -> None:
+    scores = defaultdict(list)
+    for row in comparison.tables["episodes"]:
+        scores[row["group"]].append(row["score"])
+    everything = np.concatenate([*scores.values()])
+    edges = np.linspace(min(0.0, everything.min()), max(everything.max(), 1.0), 31)  # 30 bins, as in report figure 3.1
+    for group in comparison.groups:
+        look = _look(comparison.groups, group)
+        weights = np.full(len(scores[group]), 1 / len(scores[group]))
+        axes.hist(scores[group], edges.tolist(), weights=weights.tolist(), histtype="stepfilled", alpha=0.15, **look)
+        axes.hist(scores[group], edges.tolist(), weights=weights.tolist(), histtype="step", label=group, **look)
+    axes.set_xlabel("score")
+    axes.set_ylabel("share of episodes")
+    _thousands(axes.xaxis)
+    _legend(axes)
+
+
+def _profile(axes: "Axes", comparison: Comparison) -> None:
+    for group in comparison.groups:
+        rows = [row for row in comparison.tables["profile"] if row["group"] == group]
+        tau, share, low, high = ([row[key] for row in rows] for key in ("tau", "share", "low", "high"))
+        look = _look(comparison.groups, group)
+        axes.plot(tau, share, label=group, **look)
+        axes.fill_between(tau, low, high, color=look["color"], alpha=0.2, linewidth=0)
+    axes.set_xscale("log")
+    _thousands(axes.xaxis)
+    axes.set_xlabel("score (logarithmic)")
+    axes.set_ylabel("share of episodes above")
+    axes.set_ylim(0, 1.03)
+    _legend(axes)
+
+
+def _actions(axes: "Axes", comparison: Comparison) -> None:
+    rows = defaultdict(list)
+    for row in comparison.tables["actions"]:
+        rows[row["group"]].append(row)
+    for y, group in enumerate(comparison.groups):
+        left = 0.0
+        for index, row in enumerate(rows[group]):
+            label = row["action"] if y == 0 else None
+            colour = _COLOURS[index]
+            axes.barh(y, row["network"], 0.6, left, color=colour, label=label)
+            axes.barh(y, row["random"], 0.6, left + row["network"], color=colour, hatch="////", edgecolor="white")
+            left += row["network"] + row["random"]
+    axes.set_yticks(range(len(comparison.groups)), comparison.groups)
+    axes.set_ylim(len(comparison.groups) - 0.4, -0.6)
+    axes.set_xlim(0, 1)
+    axes.xaxis.set_major_formatter("{x:.0%}")
+    axes.set_xlabel("share of steps (hatched: by chance)")
+    _legend(axes, columns=4)
+
+
+def _references(axes: "Axes", comparison: Comparison) -> None:
+    bars = [
+        (row["name"], row["score"], "#b0b0b0" if row["kind"] == "algorithm" else "#7a7a7a")
+        for row in comparison.tables["references"]
+    ]
+    bars += [
+        (row["group"], row["mean"], _look(comparison.groups, row["group"])["color"])
+        for row in comparison.tables["evaluation"]
+    ]
+    bars.sort(key=lambda bar: bar[1])
+    names, scores, colours = zip(*bars, strict=True)
+    axes.barh(range(len(bars)), scores, 0.7, color=colours)
+    axes.set_xscale("log")
+    axes.set_yticks(range(len(bars)), names, fontsize=8)
+    axes.set_ylim(-0.6, len(bars) - 0.4)
+    for y, score in enumerate(scores):
+        axes.annotate(f"{score:,.0f}", (score, y), (4, 0), textcoords="offset points", va="center", fontsize=7)
+    axes.margins(x=0.12)
+    _thousands(axes.xaxis)
+    axes.set_xlabel("mean score (logarithmic); conditions differ, see the table")

@@ -1,0 +1,253 @@
+"""Run folders to runs that can be compared; what cannot be is named with its reason."""
+
+import csv
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from atlantis_exp.config import Config, ConfigError, flatten, nearest, parse, to_dict
+from atlantis_exp.tracking.journal import Metrics, Tags, read, read_commit
+
+Array = npt.NDArray[np.float64]
+
+PROTOCOL = (
+    *("env.id", "env.frameskip", "env.sticky", "env.max_frames", "env.max_steps", "env.noop_max", "env.max_pool"),
+    *("env.crop", "evaluation.epsilon"),
+)
+"""What must be equal for scores to mean the same; the observation's size belongs to the network."""
+
+_PLAYERS = ("agent", "player")  # the config's key of what has no network: a baseline, a person
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Evaluated episodes, one row each."""
+
+    scores: Array
+    steps: Array
+    truncated: Array  # 1 where the time cap ended it
+    actions: tuple[str, ...]
+    counts: Array  # steps, (episodes, actions, 2): chosen by the network, by chance
+
+
+@dataclass(frozen=True)
+class Training:
+    """A finished training: its config, its learning curve and its evaluation after the last step."""
+
+    name: str
+    config: dict[str, Any]  # dotted keys; `evaluation.epsilon` is that of the evaluation taken
+    science: dict[str, Any]  # the dotted keys that decide its numbers
+    curve: dict[str, Array]  # frames, hours, flops (where recorded), epsilon, score (mean of the last 100 episodes)
+    episodes: Episodes
+
+
+@dataclass(frozen=True)
+class Player:
+    """A baseline or a person."""
+
+    name: str
+    config: dict[str, Any]  # dotted keys
+    episodes: Episodes
+
+
+@dataclass
+class Gathered:
+    """What the outputs folder holds, and what of it was left aside: a folder's name to the reason."""
+
+    trainings: list[Training] = field(default_factory=list)
+    players: list[Player] = field(default_factory=list)
+    skipped: dict[str, str] = field(default_factory=dict)
+
+
+class _Unusable(ValueError):
+    """A run that cannot be compared, and why."""
+
+
+def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None) -> Gathered:
+    """Read all finished runs under `outputs`, or those whose name begins with or fits one of the patterns `runs`.
+
+    A training's episodes are those of its latest evaluation after its last step, be it the training's own or one that
+    the verb `evaluate` made; given `epsilon`, of the latest at that epsilon.
+    """
+    evaluations = _evaluations(outputs)
+    gathered = Gathered()
+    for folder in sorted(path for path in (outputs / "runs").glob("*") if path.is_dir()):
+        if runs and not any(fnmatchcase(folder.name, f"{pattern}*") for pattern in runs):
+            continue
+        try:
+            tree = _config(folder)
+            if any(key in tree for key in _PLAYERS):
+                gathered.players.append(
+                    Player(folder.name, flatten(tree), _episodes(folder / "artifacts/evaluation/episodes.csv"))
+                )
+                continue
+            gathered.trainings.append(_training(folder, parse(Config, tree), evaluations[folder.name], epsilon))
+        except _Unusable as error:
+            gathered.skipped[folder.name] = str(error)
+        except (ValueError, KeyError, TypeError, OSError) as error:
+            gathered.skipped[folder.name] = f"broken: {error}"
+    return gathered
+
+
+def select(trainings: Iterable[Training], where: Sequence[str]) -> list[Training]:
+    """The trainings whose configs hold all of KEY=VALUE, with keys as `group` takes them. Raises: ConfigError."""
+    selected = list(trainings)
+    for text in where:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError(f"where={text}: write KEY=VALUE, as in where=model=cnn,seed=0")
+        _check_key("where", key, selected)
+        selected = [run for run in selected if value in _spellings(run.config.get(resolve(key, run.config)))]
+    return selected
+
+
+def group(trainings: Iterable[Training], by: Sequence[str]) -> dict[str, list[Training]]:
+    """Trainings by the values of config keys, `model` being short for `model.name`; groups in order of their labels.
+
+    Raises:
+        ConfigError: on a key that no training has.
+    """
+    trainings = list(trainings)
+    for key in by:
+        _check_key("by", key, trainings)
+    groups = defaultdict(list)
+    for training in trainings:
+        parts = []
+        for key in by:
+            name = resolve(key, training.config)
+            value = training.config.get(name)
+            parts.append(value if isinstance(value, str) else f"{name.rsplit('.')[-1] or key}={json.dumps(value)}")
+        groups[" ".join(parts) or "all"].append(training)
+    return dict(sorted(groups.items()))
+
+
+def resolve(key: str, config: Mapping[str, Any]) -> str:
+    """The dotted key that a short one stands for in a config, empty if there is none: `model` for `model.name`."""
+    return next((name for name in (key, f"{key}.name", f"{key}.id") if name in config), "")
+
+
+def refuse_mixed_protocols(trainings: Sequence[Training], by: Sequence[str]) -> None:
+    """Raise ConfigError where scores do not mean the same, but for the keys of `by`, which are the question."""
+    for key in PROTOCOL:
+        if any(key == resolve(asked, training.config) for asked in by for training in trainings):
+            continue
+        holders = defaultdict(list)
+        for training in trainings:
+            holders[json.dumps(training.config[key])].append(training.name)
+        if len(holders) > 1:
+            named = "; ".join(
+                f"{value} in {names[0]}{f' and {len(names) - 1} more' if len(names) > 1 else ''}"
+                for value, names in holders.items()
+            )
+            hint = (
+                "at_epsilon=VALUE takes evaluations at that one, `evaluate run=NAME epsilon=VALUE` makes them"
+                if key == "evaluation.epsilon"
+                else f"choose with runs= or where=, or ask for it with by={key}"
+            )
+            raise ConfigError(f"{key} differs, so the scores do not mean the same: {named}; {hint}")
+
+
+def plays_alike(player: Player, training: Training) -> bool:
+    """Whether the game is the same; a player without a network sees no crop and has no epsilon."""
+    keys = set(PROTOCOL) - {"env.crop", "evaluation.epsilon"}
+    return all(player.config.get(key) == training.config[key] for key in keys)
+
+
+def _check_key(option: str, key: str, trainings: Sequence[Training]) -> None:
+    if trainings and not any(resolve(key, training.config) for training in trainings):
+        raise ConfigError(f"{option}={key}: no such key; {nearest(key, {k for run in trainings for k in run.config})}")
+
+
+def _spellings(value: Any) -> tuple[str, str]:
+    """How a person may write a value: as Python and as YAML print it."""
+    return str(value), json.dumps(value)
+
+
+def _config(folder: Path) -> dict[str, Any]:
+    """The config of a folder that holds a finished run of ours."""
+    if "~" in folder.name:
+        raise _Unusable("put aside by resume=never")
+    try:
+        tree = json.loads((folder / "config.json").read_bytes())
+    except FileNotFoundError:
+        raise _Unusable("foreign: it has no config.json") from None
+    if not isinstance(tree, dict) or not any(key in tree for key in ("model", *_PLAYERS)):
+        raise _Unusable("foreign: its config.json is not one of ours")
+    if not (folder / "result.json").exists():
+        raise _Unusable("unfinished: the command that started it continues it")
+    return tree
+
+
+def _training(
+    folder: Path, config: Config, evaluations: Sequence[tuple[int, dict[str, Any], Path]], epsilon: float | None
+) -> Training:
+    curve: dict[str, list[float]] = defaultdict(list)
+    flops_per_update = None
+    for _, record in read(folder):
+        if isinstance(record, Tags):
+            flops_per_update = record.values.get("flops_per_update", flops_per_update)
+        elif isinstance(record, Metrics) and {"throughput/frames", "score/mean_100"} <= record.values.keys():
+            for name, metric in (
+                ("frames", "throughput/frames"),
+                ("hours", "throughput/hours"),
+                ("updates", "learning/updates"),
+                ("epsilon", "actions/epsilon"),
+                ("score", "score/mean_100"),
+            ):
+                curve[name].append(record.values[metric])
+    arrays = {name: np.array(values) for name, values in curve.items()}
+    if (updates := arrays.pop("updates", None)) is not None and flops_per_update is not None:
+        arrays["flops"] = updates * float(flops_per_update)
+
+    steps = json.loads((folder / "result.json").read_bytes())["steps"]
+    tables = [(config.evaluation.epsilon, folder / f"artifacts/evaluation/{steps:09d}.csv")]
+    tables += [
+        (facts["evaluation"]["epsilon"], path / "artifacts/evaluation/episodes.csv")
+        for _, facts, path in sorted(evaluations, key=lambda evaluation: evaluation[0])
+        if facts["step"] == steps
+    ]
+    tables = [(value, path) for value, path in tables if path.exists() and epsilon in (None, value)]
+    if not tables:
+        wanted = "" if epsilon is None else f" at epsilon {epsilon}"
+        raise _Unusable(f"no evaluation{wanted} after its last step: evaluate run={folder.name} makes one")
+    taken, path = tables[-1]
+    science = config.science()
+    science["phase"] = {str(index): phase for index, phase in enumerate(science["phase"])}
+    leaves = flatten(to_dict(config)) | {"evaluation.epsilon": taken}
+    return Training(folder.name, leaves, flatten(science), arrays, _episodes(path))
+
+
+def _evaluations(outputs: Path) -> dict[str, list[tuple[int, dict[str, Any], Path]]]:
+    """The finished runs of the verb `evaluate` by the run that they evaluate: when, with which facts, where."""
+    found: dict[str, list[tuple[int, dict[str, Any], Path]]] = defaultdict(list)
+    for path in sorted((outputs / "evaluations").glob("*/result.json")):
+        try:
+            facts, commit = json.loads((path.parent / "config.json").read_bytes()), read_commit(path.parent)
+            if commit is not None:
+                found[facts["run"]].append((commit.updated, facts, path.parent))
+        except (ValueError, KeyError, TypeError, OSError):
+            continue  # what it evaluates cannot be told
+    return found
+
+
+def _episodes(path: Path) -> Episodes:
+    with open(path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    if not rows:
+        raise ValueError(f"{path} has no episode")
+    actions = tuple(name.removesuffix("_random") for name in rows[0] if name.endswith("_random"))
+    if not actions:
+        raise _Unusable(f"{path} does not say who chose the actions: play it again")
+    chance = np.array([[float(row[f"{action}_random"]) for action in actions] for row in rows])
+    both = np.array([[float(row[action]) for action in actions] for row in rows])
+    scores, steps, truncated = (
+        np.array([float(row[name]) for row in rows]) for name in ("score", "steps", "truncated")
+    )
+    return Episodes(scores, steps, truncated, actions, np.stack((both - chance, chance), axis=2))

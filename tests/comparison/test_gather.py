@@ -1,0 +1,178 @@
+"""Which runs are compared, and why others are not."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from atlantis_exp.comparison.gather import gather, group, refuse_mixed_protocols, select
+from atlantis_exp.config import Config, ConfigError
+from atlantis_exp.tracking.journal import Journal
+from atlantis_exp.training.evaluation import Episode, Evaluation
+
+Recorded = Callable[..., Path]
+
+
+def evaluated(outputs: Path, run: Path, score: float, epsilon: float, step: int = 160) -> Path:
+    """What the verb `evaluate` leaves, as far as it is read."""
+    folder = outputs / "evaluations" / f"{run.name}-at-{step}-{score}"
+    journal = Journal(folder)
+    facts = {"run": run.name, "step": step, "evaluation": {"epsilon": epsilon}}
+    (folder / "config.json").write_text(json.dumps(facts))
+    episode = Episode(0, score, 9, False, bytearray([1, 1, 1]), bytearray([0, 0, 1]))
+    journal.artifact("evaluation/episodes.csv", Evaluation(epsilon, [episode]).table().encode())
+    journal.state_dict()
+    journal.commit()
+    journal.status("FINISHED")
+    (folder / "result.json").write_text("{}")
+    return folder
+
+
+def test_a_run_is_read_from_its_journal_its_table_and_its_config(recorded: Recorded, tmp_path: Path) -> None:
+    folder = recorded(
+        "seed=7", scores=(300.0, 100.0), curve=((3, 0.1, 0, 50), (6, 0.3, 2, 70)), flops=1_000, truncated=1
+    )
+    gathered = gather(tmp_path)
+    assert gathered.skipped == {}
+    (run,) = gathered.trainings
+    assert (run.name, run.config["seed"], run.config["model.name"]) == (folder.name, 7, "cnn")
+    assert {axis: values.tolist() for axis, values in run.curve.items()} == {
+        "frames": [3, 6],
+        "hours": [0.1, 0.3],
+        "flops": [0, 2_000],
+        "epsilon": [0.5, 0.5],
+        "score": [50, 70],
+    }
+    assert run.episodes.scores.tolist() == [300, 100]
+    assert run.episodes.steps.tolist() == [4, 4]
+    assert run.episodes.truncated.tolist() == [1, 0]
+    assert run.episodes.actions == ("NOOP", "FIRE", "RIGHTFIRE", "LEFTFIRE")
+    assert run.episodes.counts.tolist() == [[[1, 0], [1, 0], [1, 0], [0, 1]]] * 2
+
+
+def test_only_what_is_committed_counts(recorded: Recorded, tmp_path: Path) -> None:
+    folder = recorded()
+    with open(folder / "journal.jsonl", "ab") as file:
+        file.write(b'{"kind":"metrics","step":99,"time":1,"values":{"throughput/frames":9e9,"score/mean_100":1}}\n')
+    (run,) = gather(tmp_path).trainings
+    assert run.curve["frames"].tolist() == [0, 600]
+
+
+def test_broken_unfinished_foreign_and_put_aside_runs_are_named_and_do_not_count(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    good = recorded()
+    damage: dict[str, Callable[[Path], object]] = {
+        "unfinished": lambda run: (run / "result.json").unlink(),
+        "broken: .*journal.jsonl ends": lambda run: (run / "journal.jsonl").write_bytes(b"{"),
+        "broken: .*commit.json is damaged": lambda run: (run / "commit.json").write_text("{"),
+        "broken: seed: missing": lambda run: (run / "config.json").write_text('{"model": {"name": "cnn"}}'),
+        "broken: ": lambda run: (run / "config.json").write_text('{"mod'),
+        "foreign: its config.json is not one of ours": lambda run: (run / "config.json").write_text('{"lr": 1}'),
+        "foreign: it has no config.json": lambda run: (run / "config.json").unlink(),
+        "no evaluation after its last step: evaluate run=": lambda run: shutil.rmtree(run / "artifacts"),
+        "broken: .*has no episode": lambda run: next(run.rglob("*.csv")).write_text("score,steps\n"),
+        "broken: list indices": lambda run: (run / "result.json").write_text("[1]"),
+        "does not say who chose": lambda run: next(run.rglob("*.csv")).write_text("score,steps,truncated\n1,1,0\n"),
+    }
+    for index, strike in enumerate(damage.values()):
+        strike(shutil.copytree(good, good.with_name(f"run-{index}")))
+    shutil.copytree(good, good.with_name("cnn~1"))
+    (tmp_path / "runs" / "notes.txt").write_text("not a run")
+    gathered = gather(tmp_path)
+    assert [run.name for run in gathered.trainings] == [good.name]
+    assert gathered.skipped.pop("cnn~1") == "put aside by resume=never"
+    assert len(gathered.skipped) == len(damage)
+    for index, reason in enumerate(damage):
+        assert re.search(reason, gathered.skipped[f"run-{index}"])
+
+
+def test_the_latest_evaluation_after_the_last_step_counts_and_epsilon_chooses_among_them(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    run = recorded("evaluation.epsilon=0.05", scores=(1.0,))
+    assert gather(tmp_path).trainings[0].episodes.scores.tolist() == [1]
+    evaluated(tmp_path, run, 2.0, 0.1)
+    evaluated(tmp_path, run, 3.0, 0.2, step=80)  # of other weights
+    unfinished = evaluated(tmp_path, run, 4.0, 0.1)
+    (unfinished / "result.json").unlink()
+    (training,) = gather(tmp_path).trainings
+    assert (training.episodes.scores.tolist(), training.config["evaluation.epsilon"]) == ([2], 0.1)
+    assert gather(tmp_path, epsilon=0.05).trainings[0].episodes.scores.tolist() == [1]
+    none = gather(tmp_path, epsilon=0.3)
+    assert none.trainings == []
+    assert none.skipped[run.name].startswith("no evaluation at epsilon 0.3")
+
+
+def test_a_run_without_flops_has_no_such_curve(recorded: Recorded, tmp_path: Path) -> None:
+    recorded(flops=None)
+    assert set(gather(tmp_path).trainings[0].curve) == {"frames", "hours", "epsilon", "score"}
+
+
+def test_groups_are_made_by_any_config_key(recorded: Recorded, tmp_path: Path) -> None:
+    for model in ("cnn", "resnet"):
+        for seed in (0, 1):
+            recorded(f"model={model}", f"seed={seed}", f"optimizer.lr={0.1 if seed else 0.2}")
+    trainings = gather(tmp_path).trainings
+    assert {label: len(runs) for label, runs in group(trainings, ["model"]).items()} == {"cnn": 2, "resnet": 2}
+    assert list(group(trainings, ["model", "optimizer.lr"])) == [
+        "cnn lr=0.1",
+        "cnn lr=0.2",
+        "resnet lr=0.1",
+        "resnet lr=0.2",
+    ]
+    assert list(group(trainings, [])) == ["all"]
+    with pytest.raises(ConfigError, match=r"by=optimiser.lr: no such key; did you mean 'optimizer.lr'"):
+        group(trainings, ["optimiser.lr"])
+
+
+def test_runs_are_chosen_by_name_and_by_config(recorded: Recorded, tmp_path: Path) -> None:
+    for model in ("cnn", "resnet"):
+        for seed in (0, 1):
+            recorded(f"model={model}", f"seed={seed}")
+    everything = gather(tmp_path).trainings
+    assert len(everything) == 4
+    assert {run.config["model.name"] for run in gather(tmp_path, ["res"]).trainings} == {"resnet"}
+    assert {run.config["seed"] for run in gather(tmp_path, ["*-s1-*"]).trainings} == {1}
+    assert [run.name for run in gather(tmp_path, [everything[2].name]).trainings] == [everything[2].name]
+    (one,) = select(everything, ["model=cnn", "seed=1"])
+    assert (one.config["model.name"], one.config["seed"]) == ("cnn", 1)
+    assert len(select(everything, ["replay.capacity=120", "env.max_pool=false"])) == 4
+    assert select(everything, ["seed=2"]) == []
+    with pytest.raises(ConfigError, match="where=modle: no such key"):
+        select(everything, ["modle=cnn"])
+    with pytest.raises(ConfigError, match="write KEY=VALUE"):
+        select(everything, ["model"])
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        *("env.id=ALE/Atlantis-v5", "env.frameskip=4", "env.sticky=0.0", "env.max_frames=1000", "env.max_steps=41"),
+        *("env.noop_max=30", "env.crop=[0,160,210,0]", "evaluation.epsilon=0.1"),
+    ],
+)
+def test_runs_of_different_protocols_are_refused_with_the_difference_named_unless_it_is_the_question(
+    recorded: Recorded, tmp_path: Path, override: str
+) -> None:
+    first, second = recorded(), recorded(override)
+    trainings = gather(tmp_path).trainings
+    key = override.split("=")[0]
+    with pytest.raises(ConfigError, match=rf"^{key} differs") as refused:
+        refuse_mixed_protocols(trainings, ["model"])
+    assert first.name in str(refused.value)
+    assert second.name in str(refused.value)
+    assert "\n" not in str(refused.value)
+    refuse_mixed_protocols(trainings, [key])
+
+
+def test_another_network_size_or_number_of_environments_is_no_other_protocol(
+    recorded: Recorded, tmp_path: Path, tiny: Callable[..., Config]
+) -> None:
+    recorded()
+    recorded("model=resnet", "env.size=48", "env.num_envs=2", "optimizer.lr=1", "env.stack=2")
+    refuse_mixed_protocols(gather(tmp_path).trainings, ["model"])
+    assert tiny().env.size == 40

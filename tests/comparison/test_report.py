@@ -1,0 +1,145 @@
+"""The page: whole in one file, escaped, readable without its pictures; and the pictures themselves."""
+
+import io
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from atlantis_exp.comparison.figures import Drawn, draw
+from atlantis_exp.comparison.gather import gather, group
+from atlantis_exp.comparison.report import number, page
+from atlantis_exp.comparison.tables import Comparison, compare
+
+Recorded = Callable[..., Path]
+
+
+@pytest.fixture
+def comparison(recorded: Recorded, tmp_path: Path) -> Comparison:
+    for seed in (0, 1):
+        recorded("model=cnn", f"seed={seed}", scores=(1_000.0 + seed, 2_345.0, 3_100.0, 700.0))
+        recorded("model=resnet", f"seed={seed}", scores=(8_000.0 + seed, 9_876.0, 9_100.0, 8_700.0))
+    (tmp_path / "runs" / "<script>alert(1)<").mkdir()
+    gathered = gather(tmp_path)
+    return compare(gathered, group(gathered.trainings, ["model"]), ["model"], 200, 0)
+
+
+class Tags(HTMLParser):
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+        if tag not in ("meta", "path", "rect", "use", "circle"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in ("meta", "path", "rect", "use", "circle"):
+            assert self.open.pop() == tag
+
+
+def test_the_page_is_whole_fetches_nothing_and_is_made_for_phones_and_both_colour_schemes(
+    comparison: Comparison,
+) -> None:
+    text = page(comparison, draw(comparison), {"command": "compare"})
+    tags = Tags(text)
+    assert tags.open == []
+    for tag, attributes in tags.found:
+        assert tag not in ("script", "link", "iframe", "img", "object")
+        for name in ("src", "href", "xlink:href", "data"):
+            assert (attributes.get(name) or "#").startswith("#")
+    assert not re.search(r"@import|url\((?!#)", text)
+    assert ("meta", {"name": "viewport", "content": "width=device-width, initial-scale=1"}) in tags.found
+    assert "@media (prefers-color-scheme: dark)" in text
+    pictures = [attributes for tag, attributes in tags.found if tag == "svg"]
+    assert len(pictures) == 9
+    assert all(attributes["role"] == "img" and attributes["aria-label"] for attributes in pictures)
+    ids = [attributes["id"] for _, attributes in tags.found if attributes.get("id")]
+    referred = {(attributes.get("xlink:href") or "#")[1:] for tag, attributes in tags.found if tag == "use"}
+    assert referred <= set(ids)
+
+
+def test_what_comes_from_data_is_escaped(comparison: Comparison) -> None:
+    text = page(comparison, draw(comparison), {"command": "<b>&"})
+    assert "&lt;script&gt;alert(1)&lt;" in text
+    assert "&lt;b&gt;&amp;" in text
+    assert "<script" not in text
+
+
+def test_the_page_says_the_verdict_the_notes_and_every_shown_table(comparison: Comparison) -> None:
+    text = page(comparison, draw(comparison), {})
+    assert comparison.verdict in text
+    assert all(note.replace("'", "&#39;").replace('"', "&#34;") in text for note in comparison.notes)
+    for row in comparison.tables["evaluation"]:
+        assert f"{row['iqm']:,.0f} ({row['iqm_low']:,.0f} to {row['iqm_high']:,.0f})" in text
+    for row in comparison.tables["runs"]:
+        assert row["run"] in text
+    for row in comparison.tables["references"]:
+        assert row["name"] in text
+
+
+@pytest.mark.parametrize(
+    ("value", "column", "text"),
+    [
+        (12_345.6, "iqm", "12,346"),
+        (0.0, "low", "0"),
+        (0.25, "probability", "25.0%"),
+        (0.05, "epsilon", "0.05"),
+        (3, "seed", "3"),
+        (1.5e12, "flops", "1.5e+12"),
+        (0.00123, "hours", "0.00123"),
+        (True, "decided", "yes"),
+        (None, "more_seeds", "over 1,000"),
+        ("cnn", "group", "cnn"),
+    ],
+)
+def test_numbers_are_written_for_people(value: object, column: str, text: str) -> None:
+    assert number(value, column) == text
+
+
+def test_figures_are_pictures_of_something_and_take_on_the_pages_ink(comparison: Comparison) -> None:
+    figures = draw(comparison)
+    assert list(figures) == [
+        *("learning_frames", "exploration", "learning_hours", "learning_flops"),
+        *("evaluation", "distribution", "profile", "actions", "references"),
+    ]
+    for figure in figures.values():
+        pixels = np.asarray(Image.open(io.BytesIO(figure.png)).convert("RGB"))
+        assert (pixels[0, 0] == 255).all()
+        assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 20
+        assert "currentColor" in figure.svg
+        assert "#24292f" not in figure.svg
+        assert "cnn" in figure.svg
+    assert "cnn 1,673" in figures["evaluation"].alt
+
+
+def test_the_same_comparison_draws_the_same_figures(comparison: Comparison) -> None:
+    def content(figures: dict[str, Drawn]) -> list[tuple[str, bytes]]:
+        return [(figure.svg, figure.png) for figure in figures.values()]
+
+    assert content(draw(comparison)) == content(draw(comparison))
+
+
+def test_a_comparison_without_curves_has_the_other_figures(recorded: Recorded, tmp_path: Path) -> None:
+    recorded(curve=())
+    gathered = gather(tmp_path)
+    figures = draw(compare(gathered, group(gathered.trainings, ["model"]), ["model"], 200, 0))
+    assert list(figures) == ["evaluation", "distribution", "profile", "actions", "references"]
+
+
+def test_comparing_loads_no_torch() -> None:
+    program = (
+        "import sys; from atlantis_exp.comparison import figures, gather, report, tables; "
+        "print('torch' in sys.modules, 'mlflow' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "False False\n"
