@@ -3,11 +3,12 @@
 import dataclasses
 import os
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import safetensors.torch
 import torch
 from torch import nn
@@ -21,6 +22,7 @@ from atlantis_exp.learning.allocation import keep_freed_memory
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.learning.objectives import DQN, DoubleDQN, Objective
 from atlantis_exp.learning.schedules import ConstantEpsilon, ExponentialEpsilon, LinearEpsilon, Schedule
+from atlantis_exp.media import film, scene
 from atlantis_exp.networks.cnn import DQNCnn
 from atlantis_exp.networks.dropout import seed_dropout
 from atlantis_exp.networks.resnet import ResNetDQN
@@ -32,7 +34,7 @@ from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate, replay
 from atlantis_exp.training.forecast import Forecast, forecast
 from atlantis_exp.training.progress import Progress
-from atlantis_exp.training.trainer import Cadence, Evaluate, Phase, Plan, Trainer, film_of
+from atlantis_exp.training.trainer import Cadence, Evaluate, Phase, Plan, Trainer
 
 # The registry: a schema class of `config` to the class that it configures.
 NETWORKS: dict[type, type[nn.Module]] = {cfg.CnnConfig: DQNCnn, cfg.ResNetConfig: ResNetDQN}
@@ -188,7 +190,21 @@ def run_evaluation(
         )
     if not evaluation.video:
         return result, None
-    return result, film_of(replay(result.best, make_emulator(env)()), result.best.frames, result.best.steps)
+    return result, film_episode(result.best, actor, env)
+
+
+def film_episode(episode: Episode, actor: Actor, env: cfg.EnvConfig) -> bytes:
+    """An mp4 of an episode at the game's own speed of 60 frames a second, on average, with who decided what beside."""
+    chooser = "network" if isinstance(actor, EpsilonGreedy) else "constant player"
+    q_values = actor.q_values if isinstance(actor, EpsilonGreedy) else None
+
+    def pictures() -> Iterator[npt.NDArray[np.uint8]]:
+        for step, moment in enumerate(replay(episode, make_emulator(env)(), env.stack, q_values)):
+            lines = (f"step {step:,} of {episode.steps:,}", f"score {moment.score:,.0f} of {episode.score:,.0f}")
+            source = "random" if moment.random else chooser
+            yield scene(moment.screen, lines, source, ACTIONS, moment.action, moment.q_values)
+
+    return film(pictures(), 60 * episode.steps / episode.frames)
 
 
 def build_network_actor(config: cfg.Config, folder: Path, weights: str, device: str) -> tuple[Actor, int]:
@@ -235,8 +251,8 @@ def build_baseline(agent: cfg.BaselineAgentConfig) -> Actor:
     return RandomActor(len(ACTIONS)) if agent.name == "random" else ConstantActor(agent.action)
 
 
-def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: Progress) -> Trainer:
-    """All of a run; it writes under `folder` only."""
+def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: Progress, about: str = "") -> Trainer:
+    """All of a run; it writes under `folder` only. `about` opens its description, in markdown."""
     if config.threads:
         torch.set_num_threads(config.threads)
     env = config.env
@@ -269,4 +285,5 @@ def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: 
         evaluate=evaluation,
         progress=progress,
         max_steps=config.budget.steps,
+        about=about,
     )

@@ -10,6 +10,8 @@ def baseline(config: BaselineConfig) -> None:
     """Play, print the report's table, and record it all."""
     from atlantis_exp.build import build_baseline, run_evaluation
     from atlantis_exp.commands.runs import RunFolder, record_evaluation, settle
+    from atlantis_exp.commands.titles import baseline_title, labels
+    from atlantis_exp.media import run_colour
     from atlantis_exp.training.progress import Progress
 
     outputs = Path(config.paths.outputs)
@@ -18,7 +20,8 @@ def baseline(config: BaselineConfig) -> None:
     progress = Progress()
     progress.say(f"{config.agent.name} player, {config.evaluation.episodes} episodes of {config.env.id}")
     evaluation, video = run_evaluation(build_baseline(config.agent), config.env, config.evaluation, progress)
-    record_evaluation(folder, "baseline", to_dict(config), evaluation, video, config.tracking, outputs)
+    shown = labels(baseline_title(config), run_colour(config.agent.name))
+    record_evaluation(folder, "baseline", to_dict(config), evaluation, video, config.tracking, outputs, shown)
 
 
 def main() -> None:
