@@ -14,8 +14,8 @@ from typing import Any, NoReturn, get_args
 import numpy as np
 
 from atlantis_exp.commands.runs import RunFolder, State, provenance, published
-from atlantis_exp.commands.titles import colour, title
-from atlantis_exp.config import Config, digest, flatten, to_dict
+from atlantis_exp.commands.titles import colour, group, title
+from atlantis_exp.config import Config, digest
 from atlantis_exp.faults import Fault
 from atlantis_exp.media import curves, strips
 from atlantis_exp.tracking.journal import Journal, JournalError, Metrics, Status, adopt, read, read_commit
@@ -62,12 +62,10 @@ def _page(configs: Sequence[Config], folders: Sequence[RunFolder], swept: Sequen
     outputs = Path(configs[0].paths.outputs)
     identity = digest({"runs": sorted(folder.name for folder in folders)})
     sweep = RunFolder(outputs / "sweeps" / f"sweep-{identity}")
-    labels = {"mlflow.runName": f"sweep {' '.join(swept)}", "atlantis.kind": "sweep"}
+    labels = {"mlflow.runName": f"sweep {' '.join(swept)}", "atlantis.kind": "training sweep"}
     with sweep.held(), _terminable(), published(sweep, configs[0].tracking, outputs, labels) as journal:
         if (commit := read_commit(sweep.path)) is not None and commit.offset:
             journal.load_state_dict({"offset": commit.offset, "time": commit.updated})
-        else:
-            journal.params(_differences(configs))
         journal.tags(provenance())
         _describe(journal, configs, folders)
         journal.status("RUNNING")
@@ -94,7 +92,7 @@ def _page(configs: Sequence[Config], folders: Sequence[RunFolder], swept: Sequen
             describing.join()
             status, reason = _ending(folders, error)
             try:
-                _draw(journal, configs, folders)
+                _draw(journal, configs, folders, commit is not None and commit.status == "FINISHED")
                 _describe(journal, configs, folders)
             finally:
                 journal.status(status, reason)
@@ -126,13 +124,6 @@ def _ending(folders: Sequence[RunFolder], error: BaseException | None) -> tuple[
     return "KILLED", ""
 
 
-def _differences(configs: Sequence[Config]) -> dict[str, str]:
-    """What the runs of a sweep have in common, and the values of what they have not."""
-    trees = [flatten(to_dict(config)) for config in configs]
-    keys = dict.fromkeys(key for tree in trees for key in tree)
-    return {key: ",".join(dict.fromkeys(str(tree.get(key, "-")) for tree in trees)) for key in keys}
-
-
 def _describe(journal: Journal, configs: Sequence[Config], folders: Sequence[RunFolder]) -> None:
     """Write the sweep's table to its page."""
     head = ("run", "state", "steps", "mean", "+-", "median", "IQM", "high", "low", "hours")
@@ -157,14 +148,19 @@ def _describe(journal: Journal, configs: Sequence[Config], folders: Sequence[Run
     journal.commit()
 
 
-def _draw(journal: Journal, configs: Sequence[Config], folders: Sequence[RunFolder]) -> None:
-    """Write the sweep's figures and its table of numbers."""
+def _draw(journal: Journal, configs: Sequence[Config], folders: Sequence[RunFolder], was_complete: bool) -> None:
+    """Write the sweep's figures and its table of numbers; the figures also as pictures once all runs have ended."""
+    is_complete = all(folder.state == "done" for folder in folders)
     trained: dict[str, tuple[str, list[list[tuple[float, float]]]]] = {}
     for config, folder in zip(configs, folders, strict=True):
-        trained.setdefault(_group(config), (colour(config), []))[1].append(_curve(folder, "score/mean_100"))
-    journal.artifact("curves.png", curves(trained, "step", "score, mean of 100 episodes"))
+        trained.setdefault(group(config), (colour(config), []))[1].append(_curve(folder, "score/mean_100"))
+    figures = {"curves": curves(trained, "step", "score, mean of 100 episodes")}
     if evaluated := _evaluations(configs, folders):
-        journal.artifact("scores.png", strips(evaluated, "mean score of the last evaluation, a dot a run"))
+        figures["scores"] = strips(evaluated, "mean score of the last evaluation, a dot a run")
+    for name, picture in figures.items():
+        journal.artifact(f"{name}.png", picture)
+        if is_complete and not was_complete:
+            journal.image(f"sweep/{name}", picture, 0)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     rows: list[dict[str, Any]] = []
@@ -183,13 +179,8 @@ def _evaluations(configs: Sequence[Config], folders: Sequence[RunFolder]) -> dic
     groups: dict[str, tuple[str, list[float]]] = {}
     for config, folder in zip(configs, folders, strict=True):
         if (result := folder.result) is not None and result.evaluation:
-            groups.setdefault(_group(config), (colour(config), []))[1].append(result.evaluation["evaluation/mean"])
+            groups.setdefault(group(config), (colour(config), []))[1].append(result.evaluation["evaluation/mean"])
     return groups
-
-
-def _group(config: Config) -> str:
-    """What a run is but for its seed."""
-    return title(config).replace(f" s{config.seed}", "", 1)
 
 
 def _curve(folder: RunFolder, key: str) -> list[tuple[float, float]]:

@@ -9,11 +9,11 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from atlantis_exp.commands.app import CONF, checked
-from atlantis_exp.config import BaselineConfig, Config, flatten, to_dict
+from atlantis_exp.config import BaselineConfig, Config, digest, flatten, to_dict
 from atlantis_exp.media import run_colour
 
 _NAMED = ("model", "sampler", "objective", "optimizer", "epsilon")  # groups whose options carry their names
-_SPELLED = 4  # differences at most; beyond them a few digits of the identity tell runs apart
+_SPELLED = 4  # differences at most; beyond them a few digits of their hash tell runs apart
 
 
 def title(config: Config) -> str:
@@ -21,9 +21,20 @@ def title(config: Config) -> str:
 
     Configs of one identity have one title, and different ones differ in it.
     """
-    samplers = [phase.sampler for phase in config.phase.values()]
-    words = [config.model.name, *dict.fromkeys(samplers), f"s{config.seed}"]
-    words += [getattr(config, group).name for group in _NAMED[2:] if getattr(config, group).name != _defaults()[group]]
+    player, rest = _words(config)
+    return " ".join([*player, f"s{config.seed}", *rest])
+
+
+def group(config: Config) -> str:
+    """The title that runs which differ only in their seed have in common."""
+    player, rest = _words(config)
+    return " ".join([*player, *rest])
+
+
+def _words(config: Config) -> tuple[list[str], list[str]]:
+    """What is said before the seed, and after it."""
+    player = [config.model.name, *dict.fromkeys(phase.sampler for phase in config.phase.values())]
+    words = [getattr(config, group).name for group in _NAMED[2:] if getattr(config, group).name != _defaults()[group]]
     env = _nearest_env(config)
     words += [env] if env != _defaults()["env"] else []
     choices = (f"env={env}", *(f"{group}={getattr(config, group).name}" for group in _NAMED))
@@ -35,8 +46,8 @@ def title(config: Config) -> str:
     )
     words += [preset] if preset != "none" else []
     if len(differing) > _SPELLED:
-        return " ".join([*words, config.identity()[:6]])
-    return " ".join([*words, *differing])
+        return player, [*words, digest(leaves)[:6]]
+    return player, [*words, *differing]
 
 
 def colour(config: Config) -> str:

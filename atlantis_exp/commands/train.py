@@ -110,7 +110,7 @@ def _goes_on(config: Config, result: "Result") -> bool:
 def _train(config: Config, folder: "RunFolder") -> None:
     from atlantis_exp.build import build_trainer
     from atlantis_exp.commands.runs import Result, provenance, published
-    from atlantis_exp.commands.titles import colour, labels, title
+    from atlantis_exp.commands.titles import colour, group, labels, title
     from atlantis_exp.game.vector import WorkerDied
     from atlantis_exp.tracking.journal import JournalError
     from atlantis_exp.training.checkpoint import CheckpointError
@@ -121,7 +121,7 @@ def _train(config: Config, folder: "RunFolder") -> None:
     outputs = Path(config.paths.outputs)
     command = shlex.join(["python", "-m", "atlantis_exp", *sys.argv[1:]])
     stop = StopRequest(config.budget.seconds)
-    shown = {**labels(title(config), colour(config)), "atlantis.kind": "training"}
+    shown = {**labels(title(config), colour(config)), "group": group(config), "atlantis.kind": "training"}
     about = f"Network `{config.model.name}` on {config.env.id}, seed {config.seed}. Continue or report: `{command}`"
     with stop.installed(), published(folder, config.tracking, outputs, shown) as journal:
         trainer: Trainer | None = None

@@ -55,7 +55,7 @@ class Artifact:
 
 @dataclass(frozen=True)
 class Image:
-    """A PNG under `artifacts/`: one position of the step slider of `key`."""
+    """A PNG under `artifacts/`: one position, which MLflow calls a step, of the slider of `key`."""
 
     key: str
     step: int
@@ -125,7 +125,7 @@ class Tracker(Protocol):
         """Keeps a file under a relative path; the last content of a path stands."""
 
     def image(self, key: str, content: bytes, step: int) -> None:
-        """Keeps a PNG of a step."""
+        """Keeps a PNG at a position of its key's slider; runs that share positions are shown side by side."""
 
     def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None:
         """Keeps weights (safetensors) of a step and the metrics that they reached; `best` of all of the name so far."""

@@ -35,6 +35,7 @@ from atlantis_exp.tracking.journal import (
     read_commit,
     write_file,
 )
+from atlantis_exp.tracking.views import experiment_tags
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -103,6 +104,11 @@ class Store:
                 for run in page
             ]
         return found
+
+    def prepare(self) -> None:
+        """Makes the experiment explain itself and seeds its shared views, see `views`."""
+        for key, value in experiment_tags().items():
+            self.client.set_experiment_tag(self.experiment_id, key, value)
 
     @property
     def address(self) -> str:

@@ -141,6 +141,7 @@ class Trainer:
         self.lengths = np.zeros(emulators.num_envs, np.int64)  # of the episodes under way, steps
         self.episodes: list[Played] = []
         self.best_mean = -np.inf  # of all evaluations
+        self.evaluations = 0
         self.evaluated_at = -1  # steps
         self.owes_evaluation = False  # of this very step: it was asked to stop
         self.best_step = -1
@@ -208,6 +209,7 @@ class Trainer:
             "lengths": self.lengths,
             "episodes": np.array(self.episodes).reshape(-1, len(Played._fields)),
             "best_mean": None if np.isinf(self.best_mean) else self.best_mean,
+            "evaluations": self.evaluations,
             "evaluated_at": self.evaluated_at,
             "owes_evaluation": self.owes_evaluation,
             "best_step": self.best_step,
@@ -228,7 +230,7 @@ class Trainer:
         for episode, step, frames, score, length, env in state["episodes"].tolist():
             self.episodes.append(Played(int(episode), int(step), int(frames), score, int(length), int(env)))
         self.best_mean = -np.inf if state["best_mean"] is None else state["best_mean"]
-        self.evaluated_at = state["evaluated_at"]
+        self.evaluations, self.evaluated_at = state["evaluations"], state["evaluated_at"]
         self.owes_evaluation = state["owes_evaluation"]
         self.best_step = state["best_step"]
         self.last_report, self.last_metrics = state["last_report"], state["last_metrics"]
@@ -325,10 +327,12 @@ class Trainer:
         if now.episodes % self.cadence.histogram_episodes == 0:
             window = self.recent_scores(self.cadence.histogram_episodes)
             title = f"training, episodes {now.episodes - len(window) + 1}-{now.episodes}"
-            self.tracker.image("score/histogram", score_histogram(window, title), now.steps)
+            # A slider that counts windows, not steps: at each of its positions every run has a picture.
+            number = now.episodes // self.cadence.histogram_episodes - 1
+            self.tracker.image("score/histogram", score_histogram(window, title), number)
             ends = [played.episode if self.plan.unit == "episodes" else played.step for played in self.episodes]
             picture = score_heatmap(ends, self.recent_scores(now.episodes), self.plan.length, self.plan.unit)
-            self.tracker.image("score/heatmap", picture, now.steps)
+            self.tracker.image("score/heatmap", picture, number)
 
     def _record_curves(self) -> None:
         # The last multiple, not the step itself: curves of runs with different num_envs then share their grid.
@@ -403,7 +407,8 @@ class Trainer:
         self.tracker.metrics(metrics, step)
         scores = [episode.score for episode in evaluation.episodes]
         title = f"evaluation, step {step:,}"
-        self.tracker.image("evaluation/histogram", score_histogram(scores, title), step)
+        self.tracker.image("evaluation/histogram", score_histogram(scores, title), self.evaluations)
+        self.evaluations += 1
         self.tracker.artifact(f"evaluation/{step:09d}.csv", evaluation.table().encode())
         self.tracker.artifact(f"evaluation/{step:09d}.txt", evaluation.report().encode())
         weights = safetensors.torch.save(

@@ -55,7 +55,9 @@ def test_a_training_with_evaluations_is_the_same_as_one_without(
         prints.append(print_of(trainer, tmp_path / name))
     without, with_evaluations = prints
     differing = {part for part in without if without[part] != with_evaluations[part]}
-    assert differing == {"best_mean", "evaluated_at", "best_step", "last_report", "last_metrics", "history"}
+    assert differing == {
+        *("best_mean", "best_step", "evaluations", "evaluated_at", "last_report", "last_metrics", "history")
+    }
     for key in ("score/episode", "learning/loss", "actions/epsilon"):
         assert curve(tmp_path / "never", key) == curve(tmp_path / "often", key) != []
 
