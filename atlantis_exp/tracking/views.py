@@ -10,7 +10,7 @@ from typing import Any
 
 _SECTIONS = {  # cards a row, and their height in pixels
     "score": (2, 360),
-    "pictures": (1, 640),
+    "pictures": (1, 520),
     "evaluation": (2, 360),
     "actions": (2, 360),
     "learning": (2, 360),
