@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -30,6 +30,7 @@ from atlantis_exp.learning.schedules import (
     OneCycle,
     Schedule,
 )
+from atlantis_exp.media import film, scene
 from atlantis_exp.networks.cnn import DQNCnn
 from atlantis_exp.networks.dropout import seed_dropout
 from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
@@ -43,7 +44,7 @@ from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate, replay
 from atlantis_exp.training.forecast import Forecast, forecast
 from atlantis_exp.training.progress import Progress
-from atlantis_exp.training.trainer import Cadence, Evaluate, Phase, Plan, Trainer, film_of
+from atlantis_exp.training.trainer import Cadence, Evaluate, Phase, Plan, Trainer
 
 _THREADS = torch.get_num_threads()  # torch's own choice, before anything here changes it
 
@@ -245,7 +246,21 @@ def run_evaluation(
         )
     if not evaluation.video:
         return result, None
-    return result, film_of(replay(result.best, make_emulator(env)()), result.best.frames, result.best.steps)
+    return result, film_episode(result.best, actor, env)
+
+
+def film_episode(episode: Episode, actor: Actor, env: cfg.EnvConfig) -> bytes:
+    """An mp4 of an episode at the game's own speed of 60 frames a second, on average, with who decided what beside."""
+    chooser = "network" if isinstance(actor, EpsilonGreedy) else "constant player"
+    q_values = actor.q_values if isinstance(actor, EpsilonGreedy) else None
+
+    def pictures() -> Iterator[npt.NDArray[np.uint8]]:
+        for step, moment in enumerate(replay(episode, make_emulator(env)(), env.stack, q_values)):
+            lines = (f"step {step:,} of {episode.steps:,}", f"score {moment.score:,.0f} of {episode.score:,.0f}")
+            source = "random" if moment.random else chooser
+            yield scene(moment.screen, lines, source, ACTIONS, moment.action, moment.q_values)
+
+    return film(pictures(), 60 * episode.steps / episode.frames)
 
 
 def build_network_actor(config: cfg.Config, folder: Path, weights: str, device: str) -> tuple[Actor, int]:
@@ -298,8 +313,8 @@ def build_baseline(agent: cfg.BaselineAgentConfig) -> Actor:
     return RandomActor(len(ACTIONS)) if agent.name == "random" else ConstantActor(agent.action)
 
 
-def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: Progress) -> Trainer:
-    """All of a run; it writes under `folder` only."""
+def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: Progress, about: str = "") -> Trainer:
+    """All of a run; it writes under `folder` only. `about` opens its description, in markdown."""
     env = config.env
     learner = build_learner(config)
     actor = EpsilonGreedy(learner.q_values, len(ACTIONS))
@@ -333,4 +348,5 @@ def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: 
         evaluate=evaluation,
         progress=progress,
         max_steps=config.budget.steps,
+        about=about,
     )

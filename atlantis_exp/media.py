@@ -2,39 +2,148 @@
 
 import io
 import tempfile
-from collections.abc import Iterable, Sequence
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 SCORE_RANGE = (1e3, 1e6)  # the axis of every histogram, so that runs and steps can be laid side by side
 BINS = 30  # as in report figure 3.1
+COLUMNS = 40  # of a heat map: windows of the training
+BLACK, BLUE, ORANGE, GREEN, VERMILLION, GREY = "#000000", "#0072B2", "#E69F00", "#009E73", "#D55E00", "#999999"
+"""Colours that people with any colour vision tell apart (Okabe and Ito, 2008)."""
 
 
 def score_histogram(scores: Sequence[float], title: str) -> bytes:
-    """A PNG, 256 x 256, of a score distribution on a fixed logarithmic axis; scores beyond it stand at its ends."""
-    from matplotlib.figure import Figure
+    """A PNG, 256 x 256, of a score distribution on fixed axes; scores beyond them stand at their ends.
 
-    figure = Figure(figsize=(2.56, 2.56), dpi=100, layout="constrained")
-    axes = figure.add_subplot()
-    edges = np.geomspace(*SCORE_RANGE, BINS + 1)
-    axes.hist(np.clip(scores, *SCORE_RANGE), bins=edges.tolist(), color="#1f77b4")
-    axes.axvline(float(np.clip(np.mean(scores), *SCORE_RANGE)), color="#d62728", linewidth=1)
+    The axis of the shares has the root for a scale: distributions over many bins and over one are both read on it.
+    """
+    figure, axes = _square()
+    axes.hist(
+        np.clip(scores, *SCORE_RANGE), _edges().tolist(), weights=np.full(len(scores), 1 / len(scores)), color=BLUE
+    )
+    axes.axvline(float(np.clip(np.mean(scores), *SCORE_RANGE)), color=VERMILLION, linewidth=1.5)
     axes.set_xscale("log")
     axes.set_xlim(*SCORE_RANGE)
-    axes.set_ylim(0, None)
+    axes.set_yscale("function", functions=(np.sqrt, np.square))
+    axes.set_ylim(0, 1)
+    axes.set_yticks([0, 0.05, 0.25, 0.5, 1], ["0", "5 %", "25 %", "50 %", "100 %"])
     axes.set_title(title, fontsize=8)
-    axes.set_xlabel(f"score (red: mean {np.mean(scores):,.0f})", fontsize=7)
-    axes.tick_params(labelsize=6)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    return buffer.getvalue()
+    axes.set_xlabel(f"score (line: mean {np.mean(scores):,.0f})", fontsize=7)
+    return _png(figure)
 
 
-def film(screens: Iterable[npt.NDArray[np.uint8]], frames_per_second: float) -> bytes:
-    """An mp4 (h264, yuv420p, twice the screen's size) that browsers play, of (height, width, 3) uint8 screens."""
+def score_heatmap(ends: Sequence[int], scores: Sequence[float], length: int, unit: str) -> bytes:
+    """A PNG, 256 x 256, of how the score distribution moved: windows of the training by score, each column's darkest
+    bin its fullest.
+
+    ends: where each episode ended, in the unit that the training's length has; scores: of the same episodes.
+    """
+    figure, axes = _square()
+    counts, columns, _ = np.histogram2d(
+        np.clip(ends, 0, length), np.clip(scores, *SCORE_RANGE), (np.linspace(0, length, COLUMNS + 1), _edges())
+    )
+    axes.pcolormesh(columns, _edges(), (counts / np.maximum(counts.max(axis=1, keepdims=True), 1)).T, cmap="Blues")
+    axes.set_yscale("log")
+    axes.set_xlim(0, length)
+    axes.set_ylim(*SCORE_RANGE)
+    axes.set_title(f"training, {len(scores):,} episodes", fontsize=8)
+    axes.set_xlabel(unit, fontsize=7)
+    axes.set_ylabel("score", fontsize=7)
+    axes.locator_params(axis="x", nbins=4)
+    return _png(figure)
+
+
+def scene(
+    screen: npt.NDArray[np.uint8],
+    lines: Sequence[str],
+    source: str | None,
+    actions: Sequence[str],
+    chosen: int | None,
+    q_values: npt.NDArray[np.float32] | None,
+) -> npt.NDArray[np.uint8]:
+    """A picture of a film: the (210, 160, 3) screen, doubled, and beside it who decides what, and why.
+
+    A bar is empty for the action of the least value and full for that of the highest; without values there is none.
+    """
+    import cv2
+
+    picture = np.full((420, 560, 3), 24, np.uint8)
+    picture[:, :320] = screen.repeat(2, axis=0).repeat(2, axis=1)
+
+    def write(text: str, x: int, y: int, colour: tuple[int, int, int] = (255, 255, 255)) -> None:
+        cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)
+
+    for row, line in enumerate(lines):
+        write(line, 336, 32 + 24 * row)
+    if chosen is None or source is None:
+        return picture
+    colour = _rgb(ORANGE if source == "random" else BLUE)
+    cv2.rectangle(picture, (336, 116), (544, 148), colour, -1)
+    write(f"decided by: {source}", 346, 137)
+    for index, action in enumerate(actions):
+        y = 188 + 52 * index
+        write(action, 336, y, (255, 255, 255) if index == chosen else (150, 150, 150))
+        if q_values is not None:
+            write(f"Q {q_values[index]:,.2f}", 452, y, (255, 255, 255) if index == chosen else (150, 150, 150))
+            share = float(np.ptp(q_values)) and float((q_values[index] - q_values.min()) / np.ptp(q_values))
+            cv2.rectangle(picture, (336, y + 8), (544, y + 18), (70, 70, 70), -1)
+            cv2.rectangle(picture, (336, y + 8), (336 + round(208 * share), y + 18), _rgb(GREY), -1)
+        if index == chosen:
+            cv2.rectangle(picture, (328, y - 18), (552, y + 24), colour, 2)
+    return picture
+
+
+def curves(groups: Mapping[str, tuple[str, Sequence[Sequence[tuple[float, float]]]]], x: str, y: str) -> bytes:
+    """A PNG of curves, each run's thin and the mean of each group thick where all its runs have a point.
+
+    groups: by name, the colour and each run's points.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 4.5), dpi=110, layout="constrained")
+    axes = figure.add_subplot()
+    for name, (colour, runs) in groups.items():
+        for run in runs:
+            axes.plot(*np.reshape(run, (-1, 2)).T, color=colour, linewidth=0.8, alpha=0.5)
+        values = [dict(run) for run in runs]
+        shared = sorted(set.intersection(*(set(points) for points in values)))
+        means = [float(np.mean([points[at] for points in values])) for at in shared]
+        axes.plot(shared, means, color=colour, linewidth=2.5, label=f"{name} ({len(runs)})")
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.legend(frameon=False, fontsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+    return _png(figure)
+
+
+def strips(groups: Mapping[str, tuple[str, Sequence[float]]], x: str) -> bytes:
+    """A PNG of numbers as dots, a row a group, with the mean of each as a line; groups: by name, colour and numbers."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 1.2 + 0.5 * len(groups)), dpi=110, layout="constrained")
+    axes = figure.add_subplot()
+    for row, (colour, numbers) in enumerate(groups.values()):
+        axes.plot(numbers, [row] * len(numbers), "o", color=colour, markersize=7, alpha=0.8)
+        axes.plot([np.mean(numbers)] * 2, [row - 0.3, row + 0.3], color=colour, linewidth=2.5)
+    axes.set_yticks(range(len(groups)), list(groups))
+    axes.set_ylim(len(groups) - 0.5, -0.5)
+    axes.set_xlabel(x)
+    axes.spines[["top", "right"]].set_visible(False)
+    return _png(figure)
+
+
+def film(pictures: Iterable[npt.NDArray[np.uint8]], frames_per_second: float) -> bytes:
+    """An mp4 (h264, yuv420p) that browsers play, of (height, width, 3) uint8 pictures of even height and width."""
     import av
 
     # A file, since the second pass, which puts the index first so that a browser starts at once, opens it again.
@@ -43,10 +152,42 @@ def film(screens: Iterable[npt.NDArray[np.uint8]], frames_per_second: float) -> 
             rate = Fraction(frames_per_second).limit_denominator(1000)
             stream = container.add_stream("libx264", rate=rate, options={"crf": "28", "preset": "veryfast"})
             stream.pix_fmt = "yuv420p"
-            for screen in screens:
+            for picture in pictures:
                 if not stream.codec_context.is_open:
-                    stream.height, stream.width = 2 * screen.shape[0], 2 * screen.shape[1]
-                doubled = screen.repeat(2, axis=0).repeat(2, axis=1)
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(doubled, format="rgb24")))
+                    stream.height, stream.width = picture.shape[:2]
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
             container.mux(stream.encode())
         return Path(file.name).read_bytes()
+
+
+def run_colour(player: str, sampler: str | None = None) -> str:
+    """The colour of a run wherever it is drawn, as #rrggbb: the player's own, paler for other samplers than uniform."""
+    own = {"cnn": BLUE, "resnet": VERMILLION, "random": GREY, "constant": BLACK}
+    rest = (GREEN, ORANGE, "#CC79A7", "#56B4E9")
+    colour = _rgb(own.get(player) or rest[zlib.crc32(player.encode()) % len(rest)])
+    if sampler not in (None, "uniform"):
+        colour = tuple(round(255 - 0.55 * (255 - channel)) for channel in colour)
+    return "#{:02x}{:02x}{:02x}".format(*colour)
+
+
+def _edges() -> npt.NDArray[np.float64]:
+    return np.geomspace(*SCORE_RANGE, BINS + 1)
+
+
+def _square() -> "tuple[Figure, Axes]":
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(2.56, 2.56), dpi=100, layout="constrained")
+    axes = figure.add_subplot()
+    axes.tick_params(labelsize=6)
+    return figure, axes
+
+
+def _png(figure: "Figure") -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+def _rgb(colour: str) -> tuple[int, ...]:
+    return tuple(bytes.fromhex(colour[1:]))

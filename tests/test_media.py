@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from atlantis_exp.media import film, score_histogram
+from atlantis_exp.media import BLUE, ORANGE, curves, film, run_colour, scene, score_heatmap, score_histogram, strips
 
 
 def pixels(png: bytes) -> npt.NDArray[np.uint8]:
@@ -22,8 +22,12 @@ def test_a_histogram_is_a_png_of_256_by_256_pixels() -> None:
 
 
 def bars(png: bytes) -> npt.NDArray[np.intp]:
-    """Columns of the picture that a bar (colour #1f77b4) touches."""
-    return np.flatnonzero((pixels(png) == (0x1F, 0x77, 0xB4)).all(axis=2).any(axis=0))
+    """Columns of the picture that a bar touches."""
+    return np.flatnonzero(coloured(pixels(png), BLUE).any(axis=0))
+
+
+def coloured(picture: npt.NDArray[np.uint8], colour: str) -> npt.NDArray[np.bool_]:
+    return np.asarray((picture == tuple(bytes.fromhex(colour[1:]))).all(axis=2))
 
 
 def test_a_score_stands_in_the_same_column_whatever_else_is_drawn() -> None:
@@ -40,6 +44,59 @@ def test_scores_beyond_the_axis_stand_at_its_ends() -> None:
     assert 0 < low.max() < high.min()
 
 
+def test_a_share_stands_as_high_whatever_else_is_drawn() -> None:
+    def height(scores: list[float]) -> int:
+        return int(coloured(pixels(score_histogram(scores, "x")), BLUE).sum(axis=0).max())
+
+    assert height([10_000.0] * 4) == height([10_000.0] * 400) > 100
+    half = height([10_000.0] * 2 + [100_000.0] * 2)
+    assert half / height([10_000.0] * 4) == pytest.approx(0.5**0.5, abs=0.02)
+
+
+def test_a_heat_map_grows_to_the_right_on_axes_that_stay() -> None:
+    def dark(png: bytes) -> npt.NDArray[np.intp]:
+        picture = pixels(png).astype(int)
+        return np.flatnonzero(((picture[..., 2] - picture[..., 0] > 60) & (picture[..., 2] > 60)).any(axis=0))
+
+    early = dark(score_heatmap([1, 2], [2_000.0, 3_000.0], 100, "episodes"))
+    late = dark(score_heatmap([1, 2, 99], [2_000.0, 3_000.0, 90_000.0], 100, "episodes"))
+    assert pixels(score_heatmap([1], [2_000.0], 100, "episodes")).shape == (256, 256, 3)
+    assert set(early.tolist()) < set(late.tolist())
+    assert late.max() - early.max() > 150
+
+
+def test_a_scene_shows_who_decided_and_how_the_values_compare() -> None:
+    screen = np.full((210, 160, 3), 200, np.uint8)
+    q_values = np.array([0.0, 1.0, 2.5, 5.0], np.float32)
+    chance = scene(screen, ("step 1",), "random", ("A", "B", "C", "D"), 1, q_values)
+    network = scene(screen, ("step 1",), "network", ("A", "B", "C", "D"), 3, q_values)
+    assert chance.shape == (420, 560, 3)
+    assert (chance[:, :320] == 200).all()
+    assert coloured(chance, ORANGE).sum() > 1_000 < coloured(network, BLUE).sum()
+    assert not coloured(chance, BLUE).any()
+    grey = (0x99, 0x99, 0x99)
+    lengths = [int((network[y + 12, 336:545] == grey).all(axis=1).sum()) for y in (188, 240, 292, 344)]
+    assert [round(length / lengths[3], 1) for length in lengths] == [0.0, 0.2, 0.5, 1.0]
+    without = scene(screen, ("step 1",), "constant player", ("A", "B", "C", "D"), 1, None)
+    assert not (without[200, 336:545] == grey).all(axis=1).any()
+
+
+def test_colours_are_those_of_the_network_paler_where_another_sampler_is_used() -> None:
+    colours = [run_colour(model, sampler) for model in ("cnn", "resnet") for sampler in ("uniform", "top_half")]
+    assert colours[0] == BLUE.lower()
+    assert len(set(colours)) == 4
+    assert run_colour("cnn", "top_half") == colours[1]
+    assert sum(bytes.fromhex(colours[1][1:])) > sum(bytes.fromhex(colours[0][1:]))
+    assert run_colour("another") == run_colour("another", "uniform")
+
+
+def test_figures_of_a_sweep_show_every_group_in_its_colour_even_one_without_points() -> None:
+    picture = pixels(curves({"a": (BLUE, [[(0, 1.0), (9, 2.0)], [(0, 3.0)]]), "b": (ORANGE, [[]])}, "x", "y"))
+    assert coloured(picture, BLUE).any()
+    picture = pixels(strips({"a": (BLUE, [1.0, 2.0]), "b": (ORANGE, [3.0])}, "x"))
+    assert coloured(picture, ORANGE).any()
+
+
 def top_level_boxes(mp4: bytes) -> list[str]:
     boxes, at = [], 0
     while at < len(mp4):
@@ -51,8 +108,8 @@ def top_level_boxes(mp4: bytes) -> list[str]:
 
 @pytest.fixture(scope="module")
 def mp4() -> bytes:
-    screens = [np.full((210, 160, 3), level, np.uint8) for level in range(0, 240, 8)]
-    return film(screens, 20.0)
+    pictures = [np.full((420, 320, 3), level, np.uint8) for level in range(0, 240, 8)]
+    return film(pictures, 20.0)
 
 
 def test_a_film_holds_every_screen_as_h264_that_browsers_play(mp4: bytes) -> None:

@@ -124,6 +124,11 @@ def check(config_name: str, schema: type[T], arguments: list[str]) -> list[T]:
         raise ConfigError(" ".join(re.split("Config search path|full_key:", str(error))[0].split())) from None
 
 
+def swept(arguments: list[str]) -> list[str]:
+    """The overrides of a command line that name several values. Raises: ConfigError."""
+    return [text for text in _read_flags(arguments)[0] if _read_override(text).is_sweep_override()]
+
+
 def _read_flags(arguments: list[str]) -> tuple[list[str], bool]:
     """The overrides of a command line, and whether it is a sweep. Raises: ConfigError."""
     parser = get_args_parser()

@@ -10,6 +10,8 @@ def baseline(config: BaselineConfig) -> None:
     """Play, print the report's table, and record it all."""
     from atlantis_exp.build import build_baseline, run_evaluation
     from atlantis_exp.commands.runs import RunFolder, record_evaluation, settle
+    from atlantis_exp.commands.titles import baseline_title, labels
+    from atlantis_exp.media import run_colour
     from atlantis_exp.training.progress import Progress
 
     outputs = Path(config.paths.outputs)
@@ -20,7 +22,8 @@ def baseline(config: BaselineConfig) -> None:
     evaluation, video = run_evaluation(
         build_baseline(config.agent), config.env, config.evaluation, config.evaluation.episodes, progress
     )
-    record_evaluation(folder, "baseline", to_dict(config), evaluation, video, config.tracking, outputs)
+    shown = labels(baseline_title(config), run_colour(config.agent.name))
+    record_evaluation(folder, "baseline", to_dict(config), evaluation, video, config.tracking, outputs, shown)
 
 
 def main() -> None:

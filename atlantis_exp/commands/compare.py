@@ -23,10 +23,12 @@ def compare(config: CompareConfig) -> None:
         ConfigError: where nothing is to be compared, or runs of different protocols would be.
     """
     from atlantis_exp.commands.runs import RunFolder, provenance, published
+    from atlantis_exp.commands.titles import labels
     from atlantis_exp.comparison import tables
     from atlantis_exp.comparison.figures import draw
     from atlantis_exp.comparison.gather import gather, group, refuse_mixed_protocols, select
     from atlantis_exp.comparison.report import page
+    from atlantis_exp.media import run_colour
 
     outputs = Path(config.paths.outputs)
     gathered = gather(outputs, config.runs, config.at_epsilon)
@@ -51,11 +53,12 @@ def compare(config: CompareConfig) -> None:
         "bootstrap": f"{config.resamples:,} samples, seed {config.seed}",
     }
     figures = draw(comparison)
-    with folder.held(), published(folder, config.tracking, outputs) as journal:
+    tags = {**labels(folder.name, run_colour("comparison")), "atlantis.kind": "comparison"}
+    with folder.held(), published(folder, config.tracking, outputs, tags) as journal:
         folder.write_config(facts)
         journal.params({key: str(value) for key, value in flatten(facts).items()})
-        journal.tags({**made, "atlantis.kind": "comparison", "verdict": comparison.verdict})
-        journal.tags({"mlflow.note.content": "\n\n".join([comparison.verdict, *comparison.notes])})
+        journal.tags({**made, "verdict": comparison.verdict})
+        journal.note("\n\n".join([comparison.verdict, *comparison.notes]))
         for view in comparison.tables["verdict"]:
             name = view["view"].replace(" ", "_")
             journal.metrics({f"{name}/difference": view["difference"], f"{name}/decided": view["decided"]}, 0)

@@ -15,6 +15,7 @@ def evaluate(config: EvaluateConfig) -> None:
     """Play a stored network on its own environment, print the report's table, and record it beside the run."""
     from atlantis_exp.build import build_network_actor, run_evaluation
     from atlantis_exp.commands.runs import RunFolder, find_run, record_evaluation, settle
+    from atlantis_exp.commands.titles import colour, labels, title
     from atlantis_exp.training.checkpoint import CheckpointError
     from atlantis_exp.training.progress import Progress
 
@@ -35,7 +36,8 @@ def evaluate(config: EvaluateConfig) -> None:
     evaluation, video = run_evaluation(actor, trained.env, settings, settings.episodes, progress)
     facts = {"run": run.name, "step": step, "evaluation": to_dict(settings), "env": to_dict(trained.env)}
     folder = RunFolder(outputs / "evaluations" / f"{run.name}-at-{step}-{digest(facts)[:6]}")
-    record_evaluation(folder, "evaluation", facts, evaluation, video, config.tracking, outputs)
+    shown = labels(f"evaluation of {title(trained)} at {step} {digest(facts)[:6]}", colour(trained))
+    record_evaluation(folder, "evaluation", facts, evaluation, video, config.tracking, outputs, shown)
 
 
 def main() -> None:

@@ -61,6 +61,8 @@ def play(config: PlayConfig) -> None:
     """
     from atlantis_exp.build import build_person, run_evaluation
     from atlantis_exp.commands.runs import RunFolder, record_evaluation, settle
+    from atlantis_exp.commands.titles import labels
+    from atlantis_exp.media import run_colour
     from atlantis_exp.training.evaluation import Stopped
     from atlantis_exp.training.progress import Progress
 
@@ -86,7 +88,8 @@ def play(config: PlayConfig) -> None:
         window.close()
     names = (f"human-{config.player}-{config.env.id.rsplit('/')[-1]}-{number}" for number in count(1))
     folder = RunFolder(next(path for name in names if not (path := outputs / "runs" / name).exists()))
-    record_evaluation(folder, "human", to_dict(config), evaluation, video, config.tracking, outputs)
+    shown = labels(folder.name, run_colour("human"))
+    record_evaluation(folder, "human", to_dict(config), evaluation, video, config.tracking, outputs, shown)
 
 
 def main() -> None:

@@ -6,19 +6,19 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, TextIO, TypeVar, get_args
+from typing import Any, Literal, TextIO, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
 from atlantis_exp.config import ConfigError, TrackingConfig, flatten, nearest
 from atlantis_exp.faults import Fault
 from atlantis_exp.media import score_histogram
-from atlantis_exp.tracking.journal import Journal, JournalError, Status, read_commit, write_file
+from atlantis_exp.tracking.journal import Commit, Journal, JournalError, Status, read_commit, write_file
 from atlantis_exp.tracking.store import Publisher, Store, unfinished
 from atlantis_exp.training.evaluation import Evaluation
 
@@ -73,22 +73,35 @@ class RunFolder:
     @property
     def status(self) -> Status | None:
         """What the run last said of itself, None before it said anything."""
-        try:
-            commit = read_commit(self.path)
-        except JournalError as error:
-            raise Fault(str(error)) from None
-        return commit.status if commit else None
+        return commit.status if (commit := self._commit) else None
+
+    @property
+    def error(self) -> str:
+        """Why the run failed, empty if it did not."""
+        return commit.error if (commit := self._commit) else ""
+
+    @property
+    def parent(self) -> Path | None:
+        """The folder of the sweep that the run was last part of."""
+        return self.path / commit.parent if (commit := self._commit) and commit.parent else None
 
     @property
     def state(self) -> State:
         """How the run stands; one whose process was killed is interrupted, whatever its journal says."""
         if not self.has_started:
-            return "missing"
+            return "failed" if self.status == "FAILED" else "missing"
         if self.result is not None:
             return "done"
         if self.status == "FAILED":
             return "failed"
         return "running" if self.status == "RUNNING" and self._is_held() else "interrupted"
+
+    @property
+    def _commit(self) -> Commit | None:
+        try:
+            return read_commit(self.path)
+        except JournalError as error:
+            raise Fault(str(error)) from None
 
     def _is_held(self) -> bool:
         path = self.path / "lock"
@@ -146,24 +159,6 @@ def settle(outputs: Path, continued: Path | None = None) -> None:
             unreachable.add(store.address)
 
 
-@contextmanager
-def ledger(folders: Sequence[RunFolder]) -> Iterator[None]:
-    """A sweep's table of runs, before and after it."""
-    _print_table(folders)
-    try:
-        yield
-    finally:
-        _print_table(folders)
-
-
-def _print_table(folders: Sequence[RunFolder]) -> None:
-    states = [folder.state for folder in folders]
-    for folder, state in zip(folders, states, strict=True):
-        print(f"  {state:12}{folder.name}")
-    counts = ", ".join(f"{states.count(state)} {state}" for state in get_args(State) if state in states)
-    print(f"sweep of {len(folders)} runs: {counts}", flush=True)
-
-
 def find_run(outputs: Path, name: str) -> RunFolder:
     """The training run of that name, that start of a name, or the latest. Raises: ConfigError."""
     folders = [folder for folder in all_runs(outputs) if "model" in folder.config]
@@ -204,10 +199,18 @@ def provenance() -> dict[str, str]:
 
 
 @contextmanager
-def published(folder: RunFolder, tracking: TrackingConfig, outputs: Path) -> Iterator[Journal]:
-    """A journal in the run's folder that is mirrored to MLflow while it grows (tracking=mlflow). Raises: Fault."""
+def published(
+    folder: RunFolder, tracking: TrackingConfig, outputs: Path, labels: Mapping[str, str]
+) -> Iterator[Journal]:
+    """A journal in the run's folder that is mirrored to MLflow while it grows (tracking=mlflow).
+
+    labels: tags that the run bears from its first moment; see `titles.labels`.
+
+    Raises:
+        Fault: where the folder's journal is damaged.
+    """
     try:
-        journal = Journal(folder.path)
+        journal = Journal(folder.path, labels)
     except JournalError as error:
         raise Fault(str(error)) from None
     if tracking.name == "none":
@@ -231,13 +234,15 @@ def record_evaluation(
     video: bytes | None,
     tracking: TrackingConfig,
     outputs: Path,
+    labels: Mapping[str, str],
 ) -> None:
     """Print an evaluation as the report does, and keep it as a run of its own; `facts` are its params."""
     print(f"\n{evaluation.report()}\n")
-    with folder.held(), published(folder, tracking, outputs) as journal:
+    with folder.held(), published(folder, tracking, outputs, {**labels, "atlantis.kind": kind}) as journal:
         folder.write_config(facts)
         journal.params({key: str(value) for key, value in flatten(facts).items()})
-        journal.tags({**provenance(), "atlantis.kind": kind, "policy": evaluation.policy})
+        journal.tags({**provenance(), "policy": evaluation.policy})
+        journal.note(f"    {evaluation.report().replace(chr(10), chr(10) + '    ')}")
         step = int(facts.get("step", 0))
         journal.metrics(evaluation.metrics(), step)
         for index, episode in enumerate(evaluation.episodes):

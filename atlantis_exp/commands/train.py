@@ -12,7 +12,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from atlantis_exp.commands.app import run_verb
+from atlantis_exp.commands.app import run_verb, swept
 from atlantis_exp.config import Config, ConfigError, flatten, to_dict
 from atlantis_exp.faults import Fault
 
@@ -76,18 +76,22 @@ class StopRequest:
 def train(config: Config) -> None:
     """Start the run that this config is, continue it, or print its result if it has ended."""
     from atlantis_exp.commands.runs import RunFolder, settle
+    from atlantis_exp.tracking.journal import adopt
 
     outputs = Path(config.paths.outputs)
     folder = RunFolder(outputs / "runs" / config.run_name())
     settle(outputs, folder.path if folder.result is None else None)
     if config.resume == "must" and not folder.has_started:
         raise ConfigError(f"resume=must: there is no run {folder.name} under {outputs / 'runs'}")
+    parent = folder.parent
     if config.resume == "never" and folder.has_started:
         kept = next(
             path for n in range(1, 10_000) if not (path := folder.path.with_name(f"{folder.name}~{n}")).exists()
         )
         with folder.held():
             folder.path.rename(kept)
+        if parent is not None:
+            adopt(folder.path, parent)
         print(f"the run that was here is kept as {kept}")
     if folder.has_started and (result := folder.result) is not None and not _goes_on(config, result):
         print(f"run {folder.name} has ended ({result.outcome} after {result.steps:,} steps):\n")
@@ -106,6 +110,7 @@ def _goes_on(config: Config, result: "Result") -> bool:
 def _train(config: Config, folder: "RunFolder") -> None:
     from atlantis_exp.build import build_trainer, count_update_flops
     from atlantis_exp.commands.runs import Result, provenance, published
+    from atlantis_exp.commands.titles import colour, group, labels, title
     from atlantis_exp.game.vector import WorkerDied
     from atlantis_exp.tracking.journal import JournalError
     from atlantis_exp.training.checkpoint import CheckpointError
@@ -116,9 +121,12 @@ def _train(config: Config, folder: "RunFolder") -> None:
     outputs = Path(config.paths.outputs)
     command = shlex.join(["python", "-m", "atlantis_exp", *sys.argv[1:]])
     stop = StopRequest(config.budget.seconds)
-    with stop.installed(), published(folder, config.tracking, outputs) as journal:
-        trainer = build_trainer(config, folder.path, journal, progress)
+    shown = {**labels(title(config), colour(config)), "group": group(config), "atlantis.kind": "training"}
+    about = f"Network `{config.model.name}` on {config.env.id}, seed {config.seed}. Continue or report: `{command}`"
+    with stop.installed(), published(folder, config.tracking, outputs, shown) as journal:
+        trainer: Trainer | None = None
         try:
+            trainer = build_trainer(config, folder.path, journal, progress, about)
             state = trainer.checkpoints.load(trainer.memory, progress.say)
             folder.write_config(to_dict(config))
             if state is not None:
@@ -129,7 +137,7 @@ def _train(config: Config, folder: "RunFolder") -> None:
                 journal.artifact("config.json", (folder.path / "config.json").read_bytes())
                 journal.tags({"flops_per_update": str(count_update_flops(config))})
                 progress.say(f"starting run {folder.name} in {folder.path}")
-            journal.tags({**provenance(), **_facts(trainer), "atlantis.kind": "training"})
+            journal.tags({**provenance(), **_facts(trainer)})
             journal.status("RUNNING")
             if config.budget.forecast != "off":
                 _check_forecast(config, trainer.counters.steps, progress)
@@ -139,13 +147,14 @@ def _train(config: Config, folder: "RunFolder") -> None:
                 outcome = trainer.run(stop)
         except BaseException as error:
             with suppress(OSError):  # a full disk takes no status either; the next command sees that nobody holds it
-                journal.status("FAILED")
+                journal.status("FAILED", str(error) or type(error).__name__)
             if isinstance(error, WorkerDied | CheckpointError | Diverged | OSError | JournalError):
                 raise Fault(f"run {folder.name}: {error}; continue with: {command}") from error
             raise
         finally:
             progress.close()
-            trainer.emulators.close()
+            if trainer is not None:
+                trainer.emulators.close()
         journal.status("KILLED" if outcome == "interrupted" else "FINISHED")
     if outcome == "interrupted":
         stop.leave(f"run {folder.name} is committed at step {trainer.counters.steps:,}; continue with: {command}")
@@ -183,11 +192,10 @@ def _facts(trainer: "Trainer") -> dict[str, str]:
 
 
 def sweep_ledger(configs: Sequence[Config]) -> AbstractContextManager[None]:
-    """A sweep's table of runs, before and after it."""
-    from atlantis_exp.commands.runs import RunFolder, ledger
+    """A sweep's table of runs, before and after it, and its page in MLflow."""
+    from atlantis_exp.commands.sweeps import ledger
 
-    runs = dict.fromkeys(Path(config.paths.outputs) / "runs" / config.run_name() for config in configs)
-    return ledger([RunFolder(path) for path in runs])
+    return ledger(configs, swept(sys.argv[1:]))
 
 
 def main() -> None:

@@ -21,6 +21,7 @@ _KILLS = 3
 def verify_resume(config: Config) -> None:
     """Train once unbroken and once with SIGKILLs at random moments, compare, and record the verdict as a run."""
     from atlantis_exp.commands.runs import RunFolder, provenance, published
+    from atlantis_exp.commands.titles import colour, labels, title
 
     outputs = Path(config.paths.outputs)
     folder = RunFolder(outputs / "verifications" / config.run_name())
@@ -35,9 +36,11 @@ def verify_resume(config: Config) -> None:
         unbroken, killed = fingerprints(config, folder.path / "unbroken"), fingerprints(config, folder.path / "killed")
         differing = sorted(part for part in unbroken if unbroken[part] != killed[part])
         verdict = f"differs in {', '.join(differing)}" if differing else "is the unbroken one, bit for bit"
-        with published(folder, config.tracking, outputs) as journal:
+        shown = {**labels(f"verify-resume {title(config)}", colour(config)), "atlantis.kind": "verification"}
+        with published(folder, config.tracking, outputs, shown) as journal:
             journal.params({key: str(value) for key, value in flatten(to_dict(config)).items()})
-            journal.tags({**provenance(), "atlantis.kind": "verification", "verdict": verdict})
+            journal.tags({**provenance(), "verdict": verdict})
+            journal.note(f"A training that was killed {kills} times {verdict}.")
             journal.metrics({"verification/equal": not differing, "verification/kills": kills}, 0)
             hashes = json.dumps({"unbroken": unbroken, "killed": killed}, indent=2)
             journal.artifact("fingerprints.json", hashes.encode())

@@ -10,7 +10,7 @@ import os
 import re
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, Protocol, get_args
@@ -18,7 +18,9 @@ from uuid import uuid4
 
 from pydantic import TypeAdapter, ValidationError
 
-Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
+Status = Literal["SCHEDULED", "RUNNING", "FINISHED", "FAILED", "KILLED"]
+NOTE = "mlflow.note.content"
+"""The tag that MLflow shows as markdown at the top of a run's page."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Artifact:
 
 @dataclass(frozen=True)
 class Image:
-    """A PNG under `artifacts/`: one position of the step slider of `key`."""
+    """A PNG under `artifacts/`: one position, which MLflow calls a step, of the slider of `key`."""
 
     key: str
     step: int
@@ -70,6 +72,7 @@ class Model:
     time: int
     path: str
     values: dict[str, float]
+    best: bool = False  # of all of its name so far
 
 
 Record = Metrics | Params | Tags | Artifact | Image | Model
@@ -81,7 +84,9 @@ class Commit:
     """How much of a journal counts, and how its run stands.
 
     `identity` is unique to the run and changes when committed lines are taken back; `started` and `updated` are in ms
-    since 1970, `offset` in bytes.
+    since 1970, `offset` in bytes. `labels` are tags that hold from a run's first moment, even if it fails before
+    anything is committed; `error` is why it failed; `parent` is the folder, seen from this one, of the run that it is
+    shown under.
     """
 
     identity: str
@@ -89,6 +94,9 @@ class Commit:
     updated: int
     offset: int
     status: Status
+    error: str = ""
+    labels: dict[str, str] = field(default_factory=dict)
+    parent: str = ""
 
 
 class JournalError(ValueError):
@@ -110,17 +118,20 @@ class Tracker(Protocol):
     def tags(self, values: Mapping[str, str]) -> None:
         """Records what is said about the run."""
 
+    def note(self, markdown: str) -> None:
+        """Describes the run and its result so far; the last note stands."""
+
     def artifact(self, path: str, content: bytes) -> None:
         """Keeps a file under a relative path; the last content of a path stands."""
 
     def image(self, key: str, content: bytes, step: int) -> None:
-        """Keeps a PNG of a step."""
+        """Keeps a PNG at a position of its key's slider; runs that share positions are shown side by side."""
 
-    def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float]) -> None:
-        """Keeps weights (safetensors) of a step and the metrics that they reached."""
+    def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None:
+        """Keeps weights (safetensors) of a step and the metrics that they reached; `best` of all of the name so far."""
 
-    def status(self, status: Status) -> None:
-        """Says how the run stands, and reveals nothing else."""
+    def status(self, status: Status, error: str = "") -> None:
+        """Says how the run stands and why it failed, and reveals nothing else."""
 
     def commit(self) -> None:
         """Reveals all that the latest state holds; to be called once a checkpoint holding it is durable."""
@@ -138,10 +149,11 @@ class NullJournal:
     def metrics(self, values: Mapping[str, float], step: int) -> None: ...
     def params(self, values: Mapping[str, str]) -> None: ...
     def tags(self, values: Mapping[str, str]) -> None: ...
+    def note(self, markdown: str) -> None: ...
     def artifact(self, path: str, content: bytes) -> None: ...
     def image(self, key: str, content: bytes, step: int) -> None: ...
-    def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float]) -> None: ...
-    def status(self, status: Status) -> None: ...
+    def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None: ...
+    def status(self, status: Status, error: str = "") -> None: ...
     def commit(self) -> None: ...
     def state_dict(self) -> dict[str, Any]:
         return {}
@@ -161,13 +173,17 @@ class Journal:
         OSError: from `state_dict` when the disk refuses; what was durable stays so, and a later call writes the rest.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, labels: Mapping[str, str] | None = None) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
         self._time = _now()  # ms, of the latest metrics
         self._offset = 0  # bytes that are durable and that the state speaks for
         self._lines: list[bytes] = []  # a line that no checkpoint covers would be redone: memory is good enough for it
-        self._commit = read_commit(folder) or Commit(uuid4().hex, self._time, self._time, 0, "RUNNING")
+        commit = read_commit(folder) or _unborn()
+        if commit.status == "SCHEDULED":
+            commit = replace(commit, started=self._time, status="RUNNING")
+        named = {_name(key): value for key, value in (labels or {}).items()}
+        self._commit = replace(commit, labels={**commit.labels, **named})
 
     def metrics(self, values: Mapping[str, float], step: int) -> None:
         self._time = max(self._time, _now())
@@ -179,6 +195,9 @@ class Journal:
     def tags(self, values: Mapping[str, str]) -> None:
         self._append(Tags({_name(key): value for key, value in values.items()}))
 
+    def note(self, markdown: str) -> None:
+        self.tags({NOTE: markdown})
+
     def artifact(self, path: str, content: bytes) -> None:
         write_file(_inside(self._folder, path), content)
         self._append(Artifact(path))
@@ -188,17 +207,18 @@ class Journal:
         write_file(_inside(self._folder, path), content)
         self._append(Image(key, step, self._time, path))
 
-    def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float]) -> None:
+    def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None:
         if set("/.") & set(name):
             raise ValueError(f"A model's name holds neither '/' nor '.': {name!r}")
         path = f"models/{_name(name)}/{step}.safetensors"
         write_file(_inside(self._folder, path), content)
         # MLflow charts a model's metrics on the run as well: with the time of the metrics just recorded they are the
         # same points, not second ones.
-        self._append(Model(name, step, self._time, path, {_name(key): float(value) for key, value in metrics.items()}))
+        values = {_name(key): float(value) for key, value in metrics.items()}
+        self._append(Model(name, step, self._time, path, values, best))
 
-    def status(self, status: Status) -> None:
-        self._mark(replace(self._commit, status=status))
+    def status(self, status: Status, error: str = "") -> None:
+        self._mark(replace(self._commit, status=status, error=error))
 
     def commit(self) -> None:
         self._mark(replace(self._commit, offset=self._offset))
@@ -231,7 +251,7 @@ class Journal:
         # What was visible cannot be unsent: a journal that goes back behind its commit is a new run to its readers.
         identity = self._commit.identity if commit.offset >= self._commit.offset else uuid4().hex
         self._commit = replace(commit, identity=identity, updated=_now())
-        write_file(self._folder / "commit.json", _encode(asdict(self._commit)).encode())
+        _write_commit(self._folder, self._commit)
 
 
 def read_commit(folder: Path) -> Commit | None:
@@ -245,6 +265,17 @@ def read_commit(folder: Path) -> Commit | None:
         return _COMMIT.validate_json(path.read_bytes(), strict=True) if path.exists() else None
     except ValidationError:
         raise JournalError(f"{path} is damaged: remove it and issue the run's command again") from None
+
+
+def adopt(folder: Path, parent: Path) -> None:
+    """Puts a run, which may have yet to start, under another one; nobody may be writing its folder.
+
+    Raises:
+        JournalError: on a folder whose `commit.json` is damaged.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    commit = read_commit(folder) or _unborn()
+    _write_commit(folder, replace(commit, parent=os.path.relpath(parent, folder)))
 
 
 def read(folder: Path, start: int = 0, end: int | None = None) -> Iterator[tuple[int, Record]]:
@@ -276,6 +307,14 @@ def read(folder: Path, start: int = 0, end: int | None = None) -> Iterator[tuple
                 _inside(folder, fields["path"])
             start += len(line)
             yield start, _KINDS[kind](**fields)
+
+
+def _unborn() -> Commit:
+    return Commit(uuid4().hex, _now(), _now(), 0, "SCHEDULED")
+
+
+def _write_commit(folder: Path, commit: Commit) -> None:
+    write_file(folder / "commit.json", _encode(asdict(commit)).encode())
 
 
 def write_file(path: Path, content: bytes) -> None:

@@ -35,6 +35,7 @@ from atlantis_exp.tracking.journal import (
     read_commit,
     write_file,
 )
+from atlantis_exp.tracking.views import experiment_tags
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -44,6 +45,7 @@ _log = logging.getLogger(__name__)
 
 _POINTS = 500  # a call at least, where there are so many: fewer cost more each
 _PARAM_LENGTH = 6_000  # characters that MLflow keeps
+_RUN_NAME = "mlflow.runName"
 
 
 @dataclass(frozen=True)
@@ -103,6 +105,11 @@ class Store:
             ]
         return found
 
+    def prepare(self) -> None:
+        """Makes the experiment explain itself and seeds its shared views, see `views`."""
+        for key, value in experiment_tags().items():
+            self.client.set_experiment_tag(self.experiment_id, key, value)
+
     @property
     def address(self) -> str:
         """What tells this experiment from any other, in this database or elsewhere."""
@@ -113,8 +120,9 @@ class Store:
         same = f"tags.`atlantis.identity` = '{commit.identity}'"
         if found := self.client.search_runs([self.experiment_id], same, max_results=1):
             return str(found[0].info.run_id)
-        tags = {"atlantis.identity": commit.identity, "atlantis.folder": str(folder)}
-        return str(self.client.create_run(self.experiment_id, commit.started, tags, folder.name).info.run_id)
+        tags = {"atlantis.identity": commit.identity, "atlantis.folder": str(folder), **commit.labels}
+        name = commit.labels.get(_RUN_NAME, folder.name)
+        return str(self.client.create_run(self.experiment_id, commit.started, tags, name).info.run_id)
 
     def delete_run(self, run_id: str) -> None:
         """Deletes a run and its models, which MLflow would keep."""
@@ -160,7 +168,7 @@ def unfinished(folder: Path, root: Path) -> Store | None:
     cursor, commit = _Cursor.read(folder), read_commit(folder)
     if cursor is None or commit is None:
         return None
-    if (cursor.identity, cursor.offset, cursor.status) == (commit.identity, commit.offset, commit.status):
+    if (cursor.identity, cursor.offset, cursor.standing) == (commit.identity, commit.offset, _standing(commit)):
         return None
     uri, _, experiment = cursor.store.rpartition("#")
     return Store(root, experiment, uri if uri.startswith("http") else None)
@@ -230,7 +238,7 @@ def publish(folder: Path, store: Store) -> None:
         if commit is None:
             return
         cursor = _Cursor.of(folder, store, commit)
-        if (cursor.offset, cursor.status) == (commit.offset, commit.status):
+        if (cursor.offset, cursor.standing) == (commit.offset, _standing(commit)):
             return
         mirror = _Mirror(folder, store, cursor.run_id)
         points: list[Metric] = []
@@ -245,8 +253,25 @@ def publish(folder: Path, store: Store) -> None:
                 mirror.send(record)
             cursor = replace(cursor, offset=offset)
             cursor.save(folder)
-        mirror.send_status(commit)
-        replace(cursor, status=commit.status).save(folder)
+        mirror.send_standing(commit, _parent_run(folder, store, commit))
+        replace(cursor, standing=_standing(commit)).save(folder)
+
+
+def _standing(commit: Commit) -> str:
+    """What a commit says beside the journal, to be compared."""
+    return json.dumps([commit.status, commit.error, commit.labels, commit.parent])
+
+
+def _parent_run(folder: Path, store: Store, commit: Commit) -> str | None:
+    """The run that a folder's is shown under, which is published if it is not yet there."""
+    if not commit.parent:
+        return None
+    parent = (folder / commit.parent).resolve()
+    if not parent.exists():
+        return None
+    publish(parent, store)
+    cursor = _Cursor.read(parent)
+    return cursor.run_id if cursor else None
 
 
 @dataclass(frozen=True)
@@ -257,7 +282,7 @@ class _Cursor:
     identity: str
     run_id: str = ""
     offset: int = 0
-    status: str = ""
+    standing: str = ""
 
     @classmethod
     def of(cls, folder: Path, store: Store, commit: Commit) -> "_Cursor":
@@ -315,12 +340,19 @@ class _Mirror:
     def send_points(self, points: "list[Metric]") -> None:
         self._client.log_batch(self._run_id, metrics=points, synchronous=True)
 
-    def send_status(self, commit: Commit) -> None:
+    def send_standing(self, commit: Commit, parent_run: str | None) -> None:
         if commit.status == "RUNNING":
             self._client.update_run(self._run_id, commit.status)
         else:
             self._client.set_terminated(self._run_id, commit.status, commit.updated)
-        self._send_tags({"resumable": str(commit.status in ("KILLED", "FAILED")).lower()})
+        tags = {**commit.labels, "resumable": str(commit.status in ("KILLED", "FAILED")).lower()}
+        if parent_run:
+            tags["mlflow.parentRunId"] = parent_run
+        if commit.error:
+            tags["error"] = commit.error
+        elif "error" in self._client.get_run(self._run_id).data.tags:
+            self._client.delete_tag(self._run_id, "error")
+        self._send_tags(tags)
 
     def send(self, record: Params | Tags | Artifact | Image | Model) -> None:
         if isinstance(record, Artifact | Image | Model) and not (self._artifacts / record.path).exists():
@@ -377,6 +409,12 @@ class _Mirror:
         if not outputs or model_id not in {output.model_id for output in outputs.model_outputs}:
             self._client.log_outputs(self._run_id, [LoggedModelOutput(model_id, record.step)])
         self.send_points(self._points(record, model_id))
+        if record.best:
+            same = f"source_run_id = '{self._run_id}' AND name = '{record.name}' AND tags.best = 'true'"
+            for model in self._client.search_logged_models([self._experiment_id], same):
+                if model.model_id != model_id:
+                    self._client.delete_logged_model_tag(model.model_id, "best")
+            self._client.set_logged_model_tags(model_id, {"best": "true"})
 
 
 @contextmanager

@@ -5,6 +5,7 @@ import io
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,9 @@ from atlantis_exp.game.emulator import ACTIONS, Emulator
 from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.game.vector import Emulators
 from atlantis_exp.statistics import Summary, summarize
-from atlantis_exp.training.actor import Actor
+from atlantis_exp.training.actor import Actor, States
+
+QValues = Callable[[States], npt.NDArray[np.float32]]
 
 GUNS = {"centre": (100.0, 1_000.0), "side": (200.0, 2_000.0)}
 """What a step pays when a gun hits one vessel or one bomber; other sums are of several hits or of a wave's end."""
@@ -227,13 +230,29 @@ def evaluate(
     return Evaluation(epsilon, played)
 
 
-def replay(episode: Episode, emulator: Emulator) -> Iterator[npt.NDArray[np.uint8]]:
-    """Play an episode again from its seed and actions; yields its screens, (210, 160, 3) uint8, one a step."""
-    emulator.reset(episode.seed)
-    yield emulator.screen_rgb()
-    for action in episode.actions:
-        emulator.step(action)
-        yield emulator.screen_rgb()
+class Moment(NamedTuple):
+    """What was on screen before a step of an episode, and what was decided on it; at the end nothing was."""
+
+    screen: npt.NDArray[np.uint8]  # (210, 160, 3)
+    score: float  # so far
+    action: int | None
+    random: bool
+    q_values: npt.NDArray[np.float32] | None  # (actions,), what the network thought of them even where chance chose
+
+
+def replay(episode: Episode, emulator: Emulator, stack: int, q_values: QValues | None = None) -> Iterator[Moment]:
+    """Play an episode again from its seed and actions; stack in observations, as the network wants its states."""
+    observation = emulator.reset(episode.seed)
+    stacks = FrameStack(1, observation.shape[0], stack)
+    stacks.reset([0], observation[np.newaxis])
+    score = 0.0
+    for action, random in zip(episode.actions, episode.random, strict=True):
+        values = None if q_values is None else q_values(stacks.state)[0]
+        yield Moment(emulator.screen_rgb(), score, action, bool(random), values)
+        step = emulator.step(action)
+        stacks.push(step.observation[np.newaxis])
+        score += step.reward
+    yield Moment(emulator.screen_rgb(), score, None, False, None)
 
 
 def _seed_sequence(seed: int, index: int) -> np.random.SeedSequence:

@@ -84,12 +84,12 @@ class Progress:
 
     def _line(self, trainer: "Trainer") -> str:
         counters = trainer.counters
-        scores = list(trainer.recent_scores)
+        scores = trainer.recent_scores(20)
         shown = "first episode"
         if scores:
-            lengths = trainer.recent_lengths
+            lengths = [played.length for played in trainer.episodes[-100:]]
             shown = (
-                f"score {scores[-1]:,.0f}  mean of 20 {np.mean(scores[-20:]):,.0f}  "
+                f"score {scores[-1]:,.0f}  mean of 20 {np.mean(scores):,.0f}  "
                 f"duration {lengths[-1]:,} (mean of 100 {np.mean(lengths):,.0f})"
             )
         done, length = trainer.done, trainer.plan.length

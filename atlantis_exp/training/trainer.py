@@ -1,10 +1,9 @@
 """The training loop (report figure 3.1), as a page that reads like it."""
 
 import time
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +14,7 @@ from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.game.vector import Emulators, Steps
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.learning.schedules import Schedule
-from atlantis_exp.media import film, score_histogram
+from atlantis_exp.media import score_heatmap, score_histogram
 from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.replay.samplers import Sampler
 from atlantis_exp.tracking.journal import Tracker
@@ -29,6 +28,17 @@ Outcome = Literal["finished", "budget", "interrupted"]
 Stop = Callable[[], bool]
 Evaluate = Callable[[int, Progress, Stop], tuple[Evaluation, bytes | None]]
 """Plays so many episodes; with a film of the best one, if there is to be one. Raises: Stopped."""
+
+
+class Played(NamedTuple):
+    """An episode of the training, and where the training stood at its end."""
+
+    episode: int  # counted from 1
+    step: int
+    frames: int
+    score: float
+    length: int  # steps
+    env: int
 
 
 class Diverged(RuntimeError):
@@ -124,6 +134,7 @@ class Trainer:
         evaluate: Evaluate,
         progress: Progress,
         max_steps: int | None,
+        about: str = "",
     ) -> None:
         self.plan, self.cadence = plan, cadence
         self.emulators, self.stack, self.actor = emulators, stack, actor
@@ -131,12 +142,13 @@ class Trainer:
         self.exploration, self.sampling, self.seeds = exploration, sampling, seeds
         self.tracker, self.checkpoints, self.evaluate, self.progress = tracker, checkpoints, evaluate, progress
         self.max_steps = max_steps
+        self.about = about  # markdown: what the run is and how to continue it
         self.counters = Counters()
         self.scores = np.zeros(emulators.num_envs)  # of the episodes under way
         self.lengths = np.zeros(emulators.num_envs, np.int64)  # of the episodes under way, steps
-        self.recent_scores: deque[float] = deque(maxlen=max(100, cadence.histogram_episodes))
-        self.recent_lengths: deque[int] = deque(maxlen=100)  # steps
+        self.episodes: list[Played] = []
         self.best_mean = -np.inf  # of all evaluations
+        self.evaluations = 0
         self.evaluated_at = -1  # steps
         self.owes_evaluation = False  # of this very step: it was asked to stop
         self.best_step = -1
@@ -159,16 +171,20 @@ class Trainer:
         self._session_start = time.monotonic() - self.counters.seconds
         self._last_commit = time.monotonic()
         self._stop = stop
+        self._describe("running")
         if self.owes_evaluation:
             self._evaluate()
         while not self._ended and not stop():
             self._iterate()
         if self._ended and self.cadence.evaluate_at_end:
             self._evaluate()
-        self.commit()
+        outcome: Outcome = "finished" if self.done >= self.plan.length else "budget"
         if not self._ended or self.owes_evaluation:
-            return "interrupted"
-        return "finished" if self.done >= self.plan.length else "budget"
+            outcome = "interrupted"
+        self._record_episodes()
+        self._describe(outcome)
+        self.commit()
+        return outcome
 
     @property
     def phase(self) -> Phase:
@@ -203,9 +219,9 @@ class Trainer:
             "samplers": {str(index): phase.sampler.state_dict() for index, phase in enumerate(self.plan.phases)},
             "scores": self.scores,
             "lengths": self.lengths,
-            "recent_scores": list(self.recent_scores),
-            "recent_lengths": list(self.recent_lengths),
+            "episodes": np.array(self.episodes).reshape(-1, len(Played._fields)),
             "best_mean": None if np.isinf(self.best_mean) else self.best_mean,
+            "evaluations": self.evaluations,
             "evaluated_at": self.evaluated_at,
             "owes_evaluation": self.owes_evaluation,
             "best_step": self.best_step,
@@ -225,10 +241,10 @@ class Trainer:
         for index, phase in enumerate(self.plan.phases):
             phase.sampler.load_state_dict(state["samplers"][str(index)])
         self.scores, self.lengths = state["scores"], state["lengths"]
-        self.recent_scores.extend(state["recent_scores"])
-        self.recent_lengths.extend(state["recent_lengths"])
+        for episode, step, frames, score, length, env in state["episodes"].tolist():
+            self.episodes.append(Played(int(episode), int(step), int(frames), score, int(length), int(env)))
         self.best_mean = -np.inf if state["best_mean"] is None else state["best_mean"]
-        self.evaluated_at = state["evaluated_at"]
+        self.evaluations, self.evaluated_at = state["evaluations"], state["evaluated_at"]
         self.owes_evaluation = state["owes_evaluation"]
         self.best_step = state["best_step"]
         self.last_report, self.last_metrics = state["last_report"], state["last_metrics"]
@@ -237,6 +253,10 @@ class Trainer:
     @property
     def done(self) -> int:
         return self.counters.episodes if self.plan.unit == "episodes" else self.counters.steps
+
+    def recent_scores(self, count: int) -> list[float]:
+        """The scores of the last `count` episodes, the latest last."""
+        return [played.score for played in self.episodes[-count:]]
 
     @property
     def _ended(self) -> bool:
@@ -322,28 +342,23 @@ class Trainer:
     def _end_episode(self, env: int) -> None:
         score, length = float(self.scores[env]), int(self.lengths[env])
         self.scores[env], self.lengths[env] = 0.0, 0
-        self.recent_scores.append(score)
-        self.recent_lengths.append(length)
-        self.counters.episodes += 1
-        episodes = self.counters.episodes
-        self.tracker.metrics(
-            {
-                "score/episode": score,
-                "score/mean_20": float(np.mean(list(self.recent_scores)[-20:])),
-                "score/length": length,
-                "score/length_mean_100": float(np.mean(self.recent_lengths)),
-                "throughput/episodes": episodes,
-            },
-            self.counters.steps,
-        )
+        now = self.counters
+        now.episodes += 1
+        self.episodes.append(Played(now.episodes, now.steps, now.frames, score, length, env))
+        self.tracker.metrics({"score/episode": score, "score/length": length}, now.steps)
         observation = self.emulators.reset([env])
         self.stack.reset([env], observation)
         self.memory.begin(env, observation[0])
 
-        if episodes % self.cadence.histogram_episodes == 0:
-            window = list(self.recent_scores)[-self.cadence.histogram_episodes :]
-            title = f"training, episodes {episodes - len(window) + 1}-{episodes}"
-            self.tracker.image("score/histogram", score_histogram(window, title), self.counters.steps)
+        if now.episodes % self.cadence.histogram_episodes == 0:
+            window = self.recent_scores(self.cadence.histogram_episodes)
+            title = f"training, episodes {now.episodes - len(window) + 1}-{now.episodes}"
+            # A slider that counts windows, not steps: at each of its positions every run has a picture.
+            number = now.episodes // self.cadence.histogram_episodes - 1
+            self.tracker.image("score/histogram", score_histogram(window, title), number)
+            ends = [played.episode if self.plan.unit == "episodes" else played.step for played in self.episodes]
+            picture = score_heatmap(ends, self.recent_scores(now.episodes), self.plan.length, self.plan.unit)
+            self.tracker.image("score/heatmap", picture, number)
 
     def _record_curves(self) -> None:
         # The last multiple, not the step itself: curves of runs with different num_envs then share their grid.
@@ -351,9 +366,14 @@ class Trainer:
         measures = {f"learning/{name}": value for name, value in self.learner.statistics().items()}
         if (update := self.learner.first_nonfinite_update()) is not None:
             raise Diverged(f"the loss of update {update} is no finite number; the run stays at its last commit")
-        if self.recent_scores:
-            last = list(self.recent_scores)[-100:]
-            measures |= {"score/mean_100": float(np.mean(last)), "score/best_100": max(last)}
+        if self.episodes:
+            last = self.recent_scores(100)
+            measures |= {
+                "score/mean_20": float(np.mean(last[-20:])),
+                "score/mean_100": float(np.mean(last)),
+                "score/best_100": max(last),
+                "score/length_mean_100": float(np.mean([played.length for played in self.episodes[-100:]])),
+            }
         self.tracker.metrics(
             {
                 **measures,
@@ -362,6 +382,7 @@ class Trainer:
                 "learning/learning_rate": self.learner.learning_rate,
                 "learning/updates": self.learner.updates,
                 "learning/phase": self.plan.phases.index(self.phase),
+                "throughput/episodes": self.counters.episodes,
                 "throughput/frames": self.counters.frames,
                 "throughput/memory": len(self.memory),
                 "throughput/memory_bytes": self.memory.nbytes,
@@ -371,10 +392,37 @@ class Trainer:
             step,
         )
 
+    def _record_episodes(self) -> None:
+        lines = [",".join(f"{value:g}" if value % 1 else f"{value:.0f}" for value in row) for row in self.episodes]
+        self.tracker.artifact("episodes.csv", "\n".join([",".join(Played._fields), *lines, ""]).encode())
+
+    def _describe(self, standing: str) -> None:
+        """Say in a few lines of markdown what the run is, how it stands and what it has reached."""
+        now, reached = self.counters, self.last_metrics
+        lines = [
+            self.about,
+            f"**{standing}** at step {now.steps:,}: {now.episodes:,} episodes, {now.frames:,} frames, "
+            f"{self.learner.updates:,} updates, {now.seconds / 3600:.2f} hours",
+        ]
+        if reached:
+            points = ("mean", "standard_error", "median", "interquartile_mean", "high", "low")
+            scores = " | ".join(f"{reached[f'evaluation/{point}']:,.0f}" for point in points)
+            lines += [
+                "| evaluated at step | mean | +- | median | IQM | high | low | epsilon | episodes | random |\n"
+                f"|{' ---: |' * 10}\n| {self.evaluated_at:,} | {scores} | {reached['evaluation/epsilon']} | "
+                f"{reached['evaluation/episodes']:.0f} | {reached['actions/random_share']:.1%} |",
+                f"The best mean so far is {self.best_mean:,.0f}, at step {self.best_step:,}.",
+            ]
+        self.tracker.note("\n\n".join(lines))
+
     def _evaluate(self) -> None:
-        step = self.counters.steps
-        if step == self.evaluated_at:
+        if self.counters.steps == self.evaluated_at:
             return
+        step = self.counters.steps
+        if every := self.cadence.evaluate_steps:
+            # As with the curves: one that fell due on the way to this step belongs to where it fell due.
+            due = step - step % every
+            step = due if step - due < self.emulators.num_envs else step
         self.owes_evaluation = True
         try:
             episodes = self.cadence.final_episodes if self._ended else self.cadence.interim_episodes
@@ -387,27 +435,27 @@ class Trainer:
         self.tracker.tags({"policy": evaluation.policy})
         scores = [episode.score for episode in evaluation.episodes]
         title = f"evaluation, step {step:,}"
-        self.tracker.image("evaluation/histogram", score_histogram(scores, title), step)
+        self.tracker.image("evaluation/histogram", score_histogram(scores, title), self.evaluations)
+        self.evaluations += 1
         self.tracker.artifact(f"evaluation/{step:09d}.csv", evaluation.table().encode())
         self.tracker.artifact(f"evaluation/{step:09d}.txt", evaluation.report().encode())
         weights = safetensors.torch.save(
             {name: tensor.contiguous() for name, tensor in self.learner.network.state_dict().items()}
         )
         results = {name: value for name, value in metrics.items() if name.startswith("evaluation/")}
-        self.tracker.model("network", weights, step, results)
-        if evaluation.summary.mean > self.best_mean:
+        is_best = evaluation.summary.mean > self.best_mean
+        self.tracker.model("network", weights, step, results, best=is_best)
+        if is_best:
             self.best_mean, self.best_step = evaluation.summary.mean, step
             self.tracker.artifact("best.safetensors", weights)
             self.tracker.tags({"best_evaluation": f"mean {evaluation.summary.mean:,.0f} at step {step}"})
             if video is not None:
                 self.tracker.artifact("best_episode.mp4", video)
-        self.evaluated_at, self.last_report, self.last_metrics = step, evaluation.report(), metrics
+        self.evaluated_at, self.last_report = self.counters.steps, evaluation.report()
+        self.last_metrics = metrics
+        self._record_episodes()
+        self._describe("running")
         self.progress.evaluated(self, evaluation)
-
-
-def film_of(screens: Any, frames: int, steps: int) -> bytes:
-    """The film of an episode at the game's own speed of 60 frames a second, on average."""
-    return film(screens, 60 * steps / frames)
 
 
 def _passed(every: int | None, before: int, now: int) -> bool:

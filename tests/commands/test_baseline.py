@@ -43,8 +43,8 @@ def test_a_held_button_scores_2000_and_the_run_holds_its_report_table_picture_an
 
     report(checked_report(tmp_path))
     table = capsys.readouterr().out
-    assert run.info.run_name is not None
-    assert run.info.run_name in table
+    assert run.info.run_name == f"constant 1 Atlantis-v0 {composed(tmp_path).identity()[:6]}"
+    assert composed(tmp_path).run_name() in table
     assert "2,000" in table
 
 

@@ -284,9 +284,10 @@ def test_a_journal_that_was_cut_is_one_clear_line(tiny: Compose) -> None:
 def points(outputs: Path, name: str) -> list[tuple[Any, ...]]:
     with closing(sqlite3.connect(outputs / "mlflow.db")) as database:
         return database.execute(
-            "SELECT key, step, timestamp, value FROM metrics JOIN runs USING (run_uuid) WHERE name = ? AND "
-            "lifecycle_stage = 'active' ORDER BY key, timestamp, step",
-            (name,),
+            "SELECT metrics.key, step, timestamp, metrics.value FROM metrics JOIN runs USING (run_uuid) "
+            "JOIN tags USING (run_uuid) WHERE tags.key = 'atlantis.folder' AND tags.value LIKE ? "
+            "AND lifecycle_stage = 'active' ORDER BY metrics.key, timestamp, step",
+            (f"%/{name}",),
         ).fetchall()
 
 

@@ -24,6 +24,7 @@ from atlantis_exp.tracking.journal import (
     Record,
     Tags,
     Tracker,
+    adopt,
     read,
     read_commit,
     write_file,
@@ -340,6 +341,39 @@ def test_a_model_has_a_plain_name(tmp_path: Path) -> None:
     for name in ("a/b", "a.b"):
         with pytest.raises(ValueError, match="neither"):
             Journal(tmp_path).model(name, b"", 0, {})
+
+
+def test_labels_and_errors_hold_from_the_first_moment_and_across_sessions(tmp_path: Path) -> None:
+    Journal(tmp_path, {"mlflow.runName": "a", "group": "g"}).status("FAILED", "why")
+    failed = read_commit(tmp_path)
+    assert failed is not None
+    assert (failed.offset, failed.status, failed.error) == (0, "FAILED", "why")
+    Journal(tmp_path, {"mlflow.runName": "b"}).status("RUNNING")
+    running = read_commit(tmp_path)
+    assert running is not None
+    assert (running.identity, running.error) == (failed.identity, "")
+    assert running.labels == {"mlflow.runName": "b", "group": "g"}
+
+
+def test_a_run_can_be_put_under_another_before_it_starts_and_after_it_ended(tmp_path: Path) -> None:
+    run, first, second = (tmp_path / name for name in ("runs/run", "sweeps/first", "sweeps/second"))
+    adopt(run, first)
+    scheduled = read_commit(run)
+    assert scheduled is not None
+    assert (scheduled.status, scheduled.parent) == ("SCHEDULED", "../../sweeps/first")
+    journal = Journal(run)
+    journal.metrics({"score": 1.0}, 1)
+    journal.state_dict()
+    journal.commit()
+    journal.status("FINISHED")
+    ended = read_commit(run)
+    adopt(run, second)
+    adopted = read_commit(run)
+    assert ended is not None
+    assert adopted is not None
+    assert ended.parent == "../../sweeps/first"
+    assert (adopted.parent, adopted.updated, adopted.offset) == ("../../sweeps/second", ended.updated, ended.offset)
+    assert (adopted.identity, adopted.status) == (scheduled.identity, "FINISHED")
 
 
 def test_an_unknown_kind_of_record_is_named(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import PIL.Image
 import pytest
 
 from atlantis_exp.tracking import store as store_module
-from atlantis_exp.tracking.journal import Journal, Metrics, read
+from atlantis_exp.tracking.journal import Journal, Metrics, adopt, read
 from atlantis_exp.tracking.store import Publisher, Store, publish, unfinished
 
 REPOSITORY = Path(__file__).parents[2]
@@ -413,6 +413,56 @@ def test_the_status_follows_the_run_through_its_sessions(tmp_path: Path, root: P
         assert shown == status
         assert status == "RUNNING" or end == updated
     assert points(root, tmp_path) == journaled_points(tmp_path)
+
+
+def test_a_run_has_its_labels_and_the_error_it_failed_with_as_long_as_it_stands(tmp_path: Path, store: Store) -> None:
+    Journal(tmp_path, {"mlflow.runName": "cnn s0", "mlflow.runColor": "#0072b2"}).status("FAILED", "no such device")
+    publish(tmp_path, store)
+    failed = store.client.get_run(run_id(tmp_path))
+    assert (failed.info.run_name, failed.info.status) == ("cnn s0", "FAILED")
+    assert failed.data.tags["error"] == "no such device"
+    assert failed.data.tags["mlflow.runColor"] == "#0072b2"
+    Journal(tmp_path, {"mlflow.runName": "cnn s0 again"}).status("FINISHED")
+    publish(tmp_path, store)
+    finished = store.client.get_run(run_id(tmp_path))
+    assert (finished.info.run_id, finished.info.run_name) == (failed.info.run_id, "cnn s0 again")
+    assert "error" not in finished.data.tags
+
+
+def test_a_child_finds_its_parent_whichever_is_published_first_and_moves_to_another(
+    tmp_path: Path, root: Path, store: Store
+) -> None:
+    child, first, second = (tmp_path / name for name in ("runs/child", "sweeps/first", "sweeps/second"))
+    for parent in (first, second):
+        Journal(parent).status("RUNNING")
+    adopt(child, first)
+    Journal(child).status("FINISHED")
+    publish(child, store)
+    publish(first, store)
+    parent_of = "SELECT value FROM tags WHERE key = 'mlflow.parentRunId' AND run_uuid = ?"
+    assert rows(root, parent_of, run_id(child)) == [(run_id(first),)]
+    ended = rows(root, "SELECT end_time FROM runs WHERE run_uuid = ?", run_id(child))
+    adopt(child, second)
+    assert unfinished(child, root) is not None
+    publish(child, store)
+    assert rows(root, parent_of, run_id(child)) == [(run_id(second),)]
+    assert rows(root, "SELECT end_time FROM runs WHERE run_uuid = ?", run_id(child)) == ended
+    assert len(rows(root, "SELECT 1 FROM runs WHERE name = 'first'")) == 1
+
+
+def test_the_best_model_alone_is_marked_however_often_it_is_sent(tmp_path: Path, store: Store) -> None:
+    journal = Journal(tmp_path)
+    for step, best in ((1, True), (2, True), (3, False)):
+        journal.metrics({"score": float(step)}, step)
+        journal.model("network", b"weights", step, {"score": float(step)}, best=best)
+        commit(journal)
+        publish(tmp_path, store)
+    for _ in range(2):
+        same = f"source_run_id = '{run_id(tmp_path)}'"
+        models = store.client.search_logged_models([store.experiment_id], same)
+        assert {model.tags["step"]: model.tags.get("best") for model in models} == {"1": None, "2": "true", "3": None}
+        (tmp_path / "published.json").unlink()
+        publish(tmp_path, store)
 
 
 def test_a_file_that_is_gone_does_not_hold_up_the_rest(

@@ -58,14 +58,29 @@ def test_an_episode_can_be_seen_again_from_its_seed_and_actions(
 ) -> None:
     episode = played(1).best
     emulator = make_emulator(tiny("env.max_steps=25").env)()
-    screens = list(replay(episode, emulator))
-    assert len(screens) == episode.steps + 1
-    assert screens[0].shape == (210, 160, 3)
+    moments = list(replay(episode, emulator, stack=4))
+    assert len(moments) == episode.steps + 1
+    assert moments[0].screen.shape == (210, 160, 3)
+    assert [moment.action for moment in moments] == [*episode.actions, None]
+    assert [moment.random for moment in moments[:-1]] == [bool(chance) for chance in episode.random]
     emulator.reset(episode.seed)
     steps = [emulator.step(action) for action in episode.actions]
-    assert sum(step.reward for step in steps) == episode.score
+    assert sum(step.reward for step in steps) == episode.score == moments[-1].score
     assert sum(step.frames for step in steps) == episode.frames
-    assert np.array_equal(screens[-1], emulator.screen_rgb())
+    assert np.array_equal(moments[-1].screen, emulator.screen_rgb())
+
+
+def test_the_values_beside_a_film_are_those_that_the_network_decided_by(
+    tiny: Compose, played: Callable[..., Evaluation]
+) -> None:
+    learner = build_learner(tiny())
+    episode = played(1, EpsilonGreedy(learner.q_values, 4)).best
+    emulator = make_emulator(tiny("env.max_steps=25").env)()
+    asked = [moment for moment in replay(episode, emulator, 4, learner.q_values) if moment.action is not None]
+    decided = [moment for moment in asked if not moment.random]
+    assert 0 < len(decided) < len(asked)
+    assert all(moment.q_values is not None for moment in asked)
+    assert [moment.action for moment in decided] == [int(moment.q_values.argmax()) for moment in decided]  # type: ignore[union-attr]
 
 
 def test_the_actions_are_counted_by_who_chose_them() -> None:

@@ -1,3 +1,4 @@
+import csv
 import dataclasses
 import io
 import itertools
@@ -15,7 +16,7 @@ from atlantis_exp.config import Config
 from atlantis_exp.game.vector import WorkerDied
 from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.replay.samplers import Draw, Sampler
-from atlantis_exp.tracking.journal import Journal, Metrics, Tags, read
+from atlantis_exp.tracking.journal import NOTE, Image, Journal, Metrics, Tags, read
 from atlantis_exp.training.actor import ConstantActor
 from atlantis_exp.training.fingerprint import fingerprint
 from atlantis_exp.training.progress import Progress
@@ -59,7 +60,9 @@ def test_a_training_with_evaluations_is_the_same_as_one_without(
         prints.append(print_of(trainer, tmp_path / name))
     without, with_evaluations = prints
     differing = {part for part in without if without[part] != with_evaluations[part]}
-    assert differing == {"best_mean", "evaluated_at", "best_step", "last_report", "last_metrics", "history"}
+    assert differing == {
+        *("best_mean", "best_step", "evaluations", "evaluated_at", "last_report", "last_metrics", "history")
+    }
     for key in ("score/episode", "learning/loss", "actions/epsilon"):
         assert curve(tmp_path / "never", key) == curve(tmp_path / "often", key) != []
 
@@ -314,6 +317,75 @@ def test_curves_of_runs_with_different_num_envs_share_their_steps(
         trainer.run()
     steps = [[step for step, _ in curve(tmp_path / name, "actions/epsilon")] for name in ("1", "3")]
     assert steps[0] == steps[1] == list(range(20, 161, 20))
+
+
+def test_smoothed_curves_stand_on_the_common_grid_and_raw_scores_where_they_happened(
+    tiny: Compose, started: Start, tmp_path: Path
+) -> None:
+    for num_envs in (1, 3):
+        trainer = started(
+            tiny(f"env.num_envs={num_envs}", "env.workers=1", "env.max_steps=35"), tmp_path / f"{num_envs}"
+        )
+        trainer.run()
+        for key in ("score/mean_20", "score/mean_100", "score/length_mean_100", "throughput/episodes"):
+            assert {step % 20 for step, _ in curve(tmp_path / f"{num_envs}", key)} == {0}, key
+        evaluated = [step for step, _ in curve(tmp_path / f"{num_envs}", "evaluation/mean")]
+        assert evaluated == [80, 160]
+        raw = curve(tmp_path / f"{num_envs}", "score/episode")
+        assert [step for step, _ in raw] == [played.step for played in trainer.episodes]
+        assert {step % 35 for step, _ in raw} == {0}
+
+
+def test_the_table_of_episodes_is_whole_after_a_kill_and_agrees_with_the_journal(
+    tiny: Compose, started: Start, tmp_path: Path
+) -> None:
+    config = tiny("env.num_envs=3", "env.workers=1", "env.max_steps=15", "evaluation.every_steps=40")
+    started(config, tmp_path / "unbroken").run()
+    killed = started(config, tmp_path / "broken")
+    killed.run(after(20))
+    killed.commit = lambda: None  # type: ignore[method-assign]
+    killed.run(after(12))  # writes a table of what is then lost
+    started(config, tmp_path / "broken").run()
+    table = (tmp_path / "broken" / "artifacts" / "episodes.csv").read_text()
+    assert table == (tmp_path / "unbroken" / "artifacts" / "episodes.csv").read_text()
+    lines = list(csv.DictReader(io.StringIO(table)))
+    assert list(lines[0]) == ["episode", "step", "frames", "score", "length", "env"]
+    assert [int(line["episode"]) for line in lines] == list(range(1, len(lines) + 1))
+    assert {line["env"] for line in lines} == {"0", "1", "2"}
+    raw = curve(tmp_path / "broken", "score/episode")
+    assert [(int(line["step"]), float(line["score"])) for line in lines] == raw != []
+
+
+def test_pictures_count_windows_and_evaluations_so_that_runs_stand_side_by_side(
+    tiny: Compose, started: Start, tmp_path: Path
+) -> None:
+    config = tiny("env.max_steps=20", "evaluation.every_steps=40")
+    started(config, tmp_path).run(after(70))
+    started(config, tmp_path).run()
+    positions: dict[str, list[int]] = {}
+    for _, record in read(tmp_path):
+        if isinstance(record, Image):
+            positions.setdefault(record.key, []).append(record.step)
+    four = [0, 1, 2, 3]
+    assert positions == {"score/histogram": four, "score/heatmap": four, "evaluation/histogram": four}
+
+
+def test_the_description_says_how_the_run_stands_and_what_its_last_evaluation_was(
+    tiny: Compose, started: Start, tmp_path: Path
+) -> None:
+    def notes() -> list[str]:
+        return [record.values[NOTE] for _, record in read(tmp_path) if isinstance(record, Tags)]
+
+    trainer = started(tiny(), tmp_path)
+    trainer.about = "Continue with: x"
+    trainer.run(after(100))
+    assert notes()[0].startswith("Continue with: x\n\n**running** at step 0")
+    assert "**interrupted** at step 100" in notes()[-1]
+    trainer.run()
+    mean = trainer.last_metrics["evaluation/mean"]
+    assert "**finished** at step 160" in notes()[-1]
+    assert f"| 160 | {mean:,.0f} |" in notes()[-1]
+    assert f"The best mean so far is {trainer.best_mean:,.0f}, at step {trainer.best_step:,}." in notes()[-1]
 
 
 def test_a_plan_in_episodes_ends_with_its_last_episode(tiny: Compose, started: Start, tmp_path: Path) -> None:

@@ -1,0 +1,190 @@
+"""A sweep as a run of its own: what its runs are shown under, with their table and figures on its page."""
+
+import csv
+import io
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn, get_args
+
+import numpy as np
+
+from atlantis_exp.commands.runs import RunFolder, State, provenance, published
+from atlantis_exp.commands.titles import colour, group, title
+from atlantis_exp.config import Config, digest
+from atlantis_exp.faults import Fault
+from atlantis_exp.media import curves, strips
+from atlantis_exp.tracking.journal import Journal, JournalError, Metrics, Status, adopt, read, read_commit
+
+_PAGE_SECONDS = 60.0  # between two looks at the runs while they are trained
+_POINTS = ("mean", "standard_error", "median", "interquartile_mean", "high", "low")
+
+
+@contextmanager
+def ledger(configs: Sequence[Config], swept: Sequence[str]) -> Iterator[None]:
+    """Print a sweep's table of runs before and after it, and keep a page of it in MLflow (tracking=mlflow).
+
+    Whatever process trains them, the runs know their parent from their folders, where it stands before the first
+    starts. The same set of runs is the same parent again. However the block ends, the page is closed with it.
+
+    swept: the overrides that name several values, as typed.
+
+    Raises:
+        Fault: while another process runs the same sweep.
+    """
+    configs = list({config.run_name(): config for config in configs}.values())
+    folders = [RunFolder(Path(config.paths.outputs) / "runs" / config.run_name()) for config in configs]
+    _print_table(folders)
+    try:
+        if configs[0].tracking.name == "none":
+            yield
+        else:
+            with _page(configs, folders, swept):
+                yield
+    finally:
+        _print_table(folders)
+
+
+def _print_table(folders: Sequence[RunFolder]) -> None:
+    states = [folder.state for folder in folders]
+    for folder, state in zip(folders, states, strict=True):
+        print(f"  {state:12}{folder.name}")
+    counts = ", ".join(f"{states.count(state)} {state}" for state in get_args(State) if state in states)
+    print(f"sweep of {len(folders)} runs: {counts}", flush=True)
+
+
+@contextmanager
+def _page(configs: Sequence[Config], folders: Sequence[RunFolder], swept: Sequence[str]) -> Iterator[None]:
+    outputs = Path(configs[0].paths.outputs)
+    identity = digest({"runs": sorted(folder.name for folder in folders)})
+    sweep = RunFolder(outputs / "sweeps" / f"sweep-{identity}")
+    labels = {"mlflow.runName": f"sweep {' '.join(swept)}", "atlantis.kind": "training sweep"}
+    with sweep.held(), _terminable(), published(sweep, configs[0].tracking, outputs, labels) as journal:
+        if (commit := read_commit(sweep.path)) is not None and commit.offset:
+            journal.load_state_dict({"offset": commit.offset, "time": commit.updated})
+        journal.tags(provenance())
+        _describe(journal, configs, folders)
+        journal.status("RUNNING")
+        for folder in folders:
+            with suppress(Fault, JournalError), folder.held():  # what runs elsewhere stays where it is
+                adopt(folder.path, sweep.path)
+        closing = threading.Event()
+
+        def keep_describing() -> None:
+            while not closing.wait(_PAGE_SECONDS):
+                with suppress(OSError, Fault):  # the next look may fare better, and the last one tells
+                    _describe(journal, configs, folders)
+
+        describing = threading.Thread(target=keep_describing, name="sweep page", daemon=True)
+        describing.start()
+        error: BaseException | None = None
+        try:
+            yield
+        except BaseException as raised:
+            error = raised
+            raise
+        finally:
+            closing.set()
+            describing.join()
+            status, reason = _ending(folders, error)
+            try:
+                _draw(journal, configs, folders, commit is not None and commit.status == "FINISHED")
+                _describe(journal, configs, folders)
+            finally:
+                journal.status(status, reason)
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM between two runs ends the process as an exception does; a run listens for itself."""
+
+    def end(number: int, _: FrameType | None) -> NoReturn:
+        sys.exit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _ending(folders: Sequence[RunFolder], error: BaseException | None) -> tuple[Status, str]:
+    failures = [f"{folder.name}: {folder.error}" for folder in folders if folder.state == "failed"]
+    if failures:
+        return "FAILED", "\n".join([f"{len(failures)} of {len(folders)} runs failed", *failures])
+    if error is None and all(folder.state == "done" for folder in folders):
+        return "FINISHED", ""
+    ran_out_of_time = isinstance(error, Fault) and error.exit_code == 124
+    if isinstance(error, Exception) and not ran_out_of_time:
+        return "FAILED", str(error)
+    return "KILLED", ""
+
+
+def _describe(journal: Journal, configs: Sequence[Config], folders: Sequence[RunFolder]) -> None:
+    """Write the sweep's table to its page."""
+    head = ("run", "state", "steps", "mean", "+-", "median", "IQM", "high", "low", "hours")
+    lines = [f"| {' | '.join(head)} |", f"|{' --- |' * 2}{' ---: |' * 8}"]
+    failures = []
+    for config, folder in zip(configs, folders, strict=True):
+        row = [title(config), folder.state]
+        if (result := folder.result) is not None:
+            scores = [f"{result.evaluation[f'evaluation/{point}']:,.0f}" for point in _POINTS if result.evaluation]
+            row += [f"{result.steps:,}", *(scores or [""] * len(_POINTS)), f"{result.counts['hours']:.2f}"]
+        lines.append(f"| {' | '.join(row + [''] * (len(head) - len(row)))} |")
+        if folder.state == "failed":
+            failures.append(f"**{title(config)} failed**: {folder.error}")
+    groups = [
+        f"| {name} | {len(means)} | {np.mean(means):,.0f} | {min(means):,.0f} | {max(means):,.0f} |"
+        for name, (_, means) in _evaluations(configs, folders).items()
+    ]
+    summary = ["| group | runs | mean of the means | lowest | highest |\n| --- | ---: | ---: | ---: | ---: |", *groups]
+    parts = ["\n".join(lines), *failures, "\n".join(summary) if groups else "", "Figures: `curves.png`, `scores.png`."]
+    journal.note("\n\n".join(part for part in parts if part))
+    journal.state_dict()
+    journal.commit()
+
+
+def _draw(journal: Journal, configs: Sequence[Config], folders: Sequence[RunFolder], was_complete: bool) -> None:
+    """Write the sweep's figures and its table of numbers; the figures also as pictures once all runs have ended."""
+    is_complete = all(folder.state == "done" for folder in folders)
+    trained: dict[str, tuple[str, list[list[tuple[float, float]]]]] = {}
+    for config, folder in zip(configs, folders, strict=True):
+        trained.setdefault(group(config), (colour(config), []))[1].append(_curve(folder, "score/mean_100"))
+    figures = {"curves": curves(trained, "step", "score, mean of 100 episodes")}
+    if evaluated := _evaluations(configs, folders):
+        figures["scores"] = strips(evaluated, "mean score of the last evaluation, a dot a run")
+    for name, picture in figures.items():
+        journal.artifact(f"{name}.png", picture)
+        if is_complete and not was_complete:
+            journal.image(f"sweep/{name}", picture, 0)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    rows: list[dict[str, Any]] = []
+    for config, folder in zip(configs, folders, strict=True):
+        result = folder.result
+        numbers = {"steps": result.steps, **result.counts, **result.evaluation} if result else {}
+        rows.append({"run": folder.name, "title": title(config), "state": folder.state, **numbers})
+    head = list(dict.fromkeys(key for row in rows for key in row))
+    writer.writerow(head)
+    writer.writerows([row.get(key, "") for key in head] for row in rows)
+    journal.artifact("runs.csv", text.getvalue().encode())
+
+
+def _evaluations(configs: Sequence[Config], folders: Sequence[RunFolder]) -> dict[str, tuple[str, list[float]]]:
+    """The colour of each group and the evaluated means of its runs."""
+    groups: dict[str, tuple[str, list[float]]] = {}
+    for config, folder in zip(configs, folders, strict=True):
+        if (result := folder.result) is not None and result.evaluation:
+            groups.setdefault(group(config), (colour(config), []))[1].append(result.evaluation["evaluation/mean"])
+    return groups
+
+
+def _curve(folder: RunFolder, key: str) -> list[tuple[float, float]]:
+    with suppress(ValueError, OSError):  # of a journal that was damaged: the run's own command says so
+        records = (record for _, record in read(folder.path) if isinstance(record, Metrics) and key in record.values)
+        return [(record.step, record.values[key]) for record in records]
+    return []

@@ -1,0 +1,166 @@
+"""Prepared pages of the MLflow UI: what a person sees first.
+
+A shared view is a tag of the experiment in a format that MLflow keeps to itself (3.17); a test opens them in a browser.
+"""
+
+import base64
+import json
+import zlib
+from typing import Any
+
+_SECTIONS = {  # cards a row, and their height in pixels
+    "score": (2, 360),
+    "pictures": (1, 520),
+    "evaluation": (2, 360),
+    "actions": (2, 360),
+    "learning": (2, 360),
+    "throughput": (2, 360),
+}
+_COLUMNS = (
+    *("params.`model.name`", "params.`sampler.name`", "params.`seed`", "metrics.`evaluation/mean`"),
+    *("metrics.`evaluation/interquartile_mean`", "metrics.`evaluation/high`", "metrics.`actions/random_share`"),
+)
+
+START, SWEEP = "start", "sweep"
+"""The keys of the shared views, as `viewStateShareKey` in an address takes them."""
+
+NOTE = """\
+**Does network B play Atlantis better than network A, and how sure is that?**
+
+- Two views are prepared (share key in the address): **Start here** has a line a run, the best evaluation first, and
+  **Sweep** has a line a group of runs that differ only in their seed, their mean with its range, and the sweeps'
+  own figures.
+- A run's name says what differs from the defaults: network, samplers, seed, then the rest. Blues are DQNCnn, reds
+  ResNetDQN, paler ones sample otherwise than uniformly; grey is the random player.
+- `score/` is the training's own play, with the exploration that `actions/epsilon` shows. `evaluation/` is what counts:
+  episodes at a small fixed epsilon, on emulators of their own.
+- Under `pictures`, the slider counts windows of the training (histogram of the window, heat map of all up to it) and
+  evaluations, from 0: at each position the runs stand side by side.
+- A run's page: its description has the result and how to continue it; *Artifacts* has `best_episode.mp4`,
+  `episodes.csv` and every evaluation's table. *Models* lists the weights of each evaluation; `best` marks the best.
+- A sweep is a run, too: the table and figures of its runs are on its page.
+"""
+
+
+def experiment_tags() -> dict[str, str]:
+    """The tags of an experiment that explain it and prepare its views."""
+    tags = {"mlflow.note.content": NOTE, "mlflow.experimentKind": "custom_model_development"}
+    for key, name, state in ((START, "Start here", _start_here()), (SWEEP, "Sweep", _sweep())):
+        packed = "deflate;" + base64.b64encode(zlib.compress(json.dumps(state).encode())).decode()
+        view = {"name": name, "createdAt": 0, "updatedAt": 0, "state": packed}
+        tags[f"mlflow.sharedViewState.{key}"] = json.dumps(view)
+    return tags
+
+
+def address(server: str, experiment_id: str, view: str) -> str:
+    """What opens a view of an experiment on a server."""
+    return (
+        f"{server}/#/experiments/{experiment_id}/runs?workflowType=machine_learning&compareRunsMode=CHART"
+        f"&viewStateShareKey={view}"
+    )
+
+
+def _start_here() -> dict[str, Any]:
+    parallel = {
+        "selectedParams": ["model.name", "sampler.name", "seed"],
+        "selectedMetrics": ["evaluation/interquartile_mean"],
+        "showAllRuns": True,
+    }
+    charts = [
+        _line("score", "score/mean_100"),
+        _line("score", "score/episode"),
+        _images("pictures", "score/histogram", "score/heatmap"),
+        _images("pictures", "evaluation/histogram"),
+        _line("evaluation", "evaluation/mean"),
+        _bar("evaluation", "evaluation/interquartile_mean"),
+        _chart("PARALLEL", "evaluation", **parallel),  # not among groups, which have only numbers for params
+        _line("actions", "actions/epsilon"),
+        _line("actions", "actions/network_share"),
+        _line("learning", "learning/loss"),
+        _line("learning", "learning/updates"),
+        _line("throughput", "throughput/steps_per_second"),
+        _line("throughput", "throughput/episodes"),
+    ]
+    return {
+        **_page(START, charts),
+        # Sorted by anything but time MLflow shows a sweep's runs themselves, else their collapsed parent.
+        "orderByKey": "metrics.`evaluation/interquartile_mean`",
+        "searchFilter": "tags.`atlantis.kind` != 'training sweep'",
+    }
+
+
+def _sweep() -> dict[str, Any]:
+    charts = [
+        _line("score", "score/mean_100"),
+        _line("evaluation", "evaluation/mean"),
+        _bar("evaluation", "evaluation/interquartile_mean"),
+        # Groups have no pictures of their own: these are of the sweeps, which are in none of them.
+        _images("pictures", "sweep/curves", "sweep/scores"),
+    ]
+    return {
+        **_page(SWEEP, charts),
+        "groupBy": {"aggregateFunction": "average", "groupByKeys": [{"mode": "tag", "groupByData": "group"}]},
+        "groupsExpanded": {"tag.group": True},  # of the runs that are in no group: while collapsed they show nothing
+        "useGroupedValuesInCharts": True,
+        "orderByKey": "metrics.`evaluation/interquartile_mean`",
+        "searchFilter": "tags.`atlantis.kind` LIKE 'training%'",
+    }
+
+
+def _page(view: str, charts: list[dict[str, Any]]) -> dict[str, Any]:
+    sections = [
+        {
+            "uuid": name,
+            "name": name,
+            "columns": columns,
+            "cardHeight": height,
+            "display": True,
+            "isReordered": True,
+            "deleted": False,
+            "isGenerated": False,
+        }
+        for name, (columns, height) in _SECTIONS.items()
+    ]
+    # A picture that no chart shows alone would get one that does; a deleted one prevents it.
+    covered = {key for chart in charts for key in chart.get("imageKeys", [])}
+    charts = [*charts, *({**_images("pictures", key), "deleted": True} for key in sorted(covered))]
+    return {
+        "selectedColumns": list(_COLUMNS),
+        "runsExpanded": {},
+        "runsPinned": [],
+        "runsHidden": [],
+        "runsHiddenMode": "FIRST_20_RUNS",
+        "compareRunCharts": [{**chart, "uuid": f"{view}-{index}"} for index, chart in enumerate(charts)],
+        "compareRunSections": sections,
+        "isAccordionReordered": True,
+        "viewMaximized": False,
+        "runListHidden": False,
+        "hideEmptyCharts": True,
+        "autoRefreshEnabled": True,
+        "groupBy": None,
+        "groupsExpanded": {},
+        "globalLineChartConfig": {"xAxisKey": "step", "lineSmoothness": 0, "selectedXAxisMetricKey": ""},
+        "orderByAsc": False,
+        "startTime": "ALL",
+        "lifecycleFilter": "Active",
+        "modelVersionFilter": "All Runs",
+        "datasetsFilter": [],
+    }
+
+
+def _line(section: str, key: str) -> dict[str, Any]:
+    axes = {"xAxisKey": "step", "xAxisScaleType": "linear", "scaleType": "linear", "yAxisKey": "metric"}
+    return _chart("LINE", section, metricKey=key, selectedMetricKeys=[key], lineSmoothness=0, **axes)
+
+
+def _bar(section: str, key: str) -> dict[str, Any]:
+    return _chart("BAR", section, metricKey=key)
+
+
+def _images(section: str, *keys: str) -> dict[str, Any]:
+    return _chart("IMAGE", section, imageKeys=list(keys), step=0, showRunParams=False)
+
+
+def _chart(kind: str, section: str, **settings: Any) -> dict[str, Any]:
+    shown = {"runsCountToCompare": 20, "deleted": False, "isGenerated": False}
+    return {"type": kind, "metricSectionId": section, **shown, **settings}

@@ -1,0 +1,128 @@
+"""A sweep and its page, in a real store: whatever process trains the runs, and however it ends."""
+
+import csv
+import dataclasses
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from atlantis_exp.commands.sweeps import ledger
+from atlantis_exp.commands.train import train
+from atlantis_exp.config import Config, ConfigError
+from atlantis_exp.tracking.journal import read_commit
+
+Compose = Callable[..., Config]
+REPOSITORY = Path(__file__).parents[2]
+SHORT = ("tracking=mlflow", "tracking.every_steps=20", "phase.quick.steps=80", "evaluation.every_steps=null")
+
+
+@pytest.fixture
+def pair(tiny: Compose) -> list[Config]:
+    """A sweep of two seeds."""
+    return [tiny(*SHORT, f"seed={seed}") for seed in (0, 1)]
+
+
+def rows(outputs: str, query: str, *values: Any) -> list[tuple[Any, ...]]:
+    with closing(sqlite3.connect(Path(outputs) / "mlflow.db")) as database:
+        return database.execute(query, values).fetchall()
+
+
+def tags(outputs: str, key: str) -> dict[str, str]:
+    """Of the runs that bear it, by name."""
+    return dict(rows(outputs, "SELECT name, value FROM tags JOIN runs USING (run_uuid) WHERE key = ?", key))
+
+
+def test_runs_trained_by_processes_of_their_own_have_one_parent_and_a_repeated_sweep_the_same(
+    pair: list[Config], tiny_overrides: tuple[str, ...]
+) -> None:
+    outputs = pair[0].paths.outputs
+    with ledger(pair, ["seed=0,1"]):
+        command = (sys.executable, "-m", "atlantis_exp", *tiny_overrides, *SHORT, f"paths.outputs={outputs}")
+        processes = [
+            subprocess.Popen((*command, f"seed={config.seed}"), cwd=REPOSITORY, stdout=subprocess.DEVNULL)
+            for config in pair
+        ]
+        assert [process.wait() for process in processes] == [0, 0]
+    sweeps = rows(outputs, "SELECT run_uuid, status FROM runs WHERE name = 'sweep seed=0,1'")
+    assert sweeps == [(sweeps[0][0], "FINISHED")]
+    children = tags(outputs, "mlflow.parentRunId")
+    assert len(children) == 2
+    assert set(children.values()) == {sweeps[0][0]}
+    note = tags(outputs, "mlflow.note.content")["sweep seed=0,1"]
+    assert all(f"| {name} | done | 80 |" in note for name in children)
+    assert "| cnn uniform quick" in note  # the group of both
+    page = next(Path(outputs, "sweeps").glob("sweep-*")) / "artifacts"
+    table = list(csv.DictReader((page / "runs.csv").open()))
+    assert {line["run"] for line in table} == {config.run_name() for config in pair}
+    assert {path.name for path in page.glob("*.png")} == {"curves.png", "scores.png"}
+
+    with ledger(pair, ["seed=0,1"]):
+        for config in pair:
+            train(config)
+    assert rows(outputs, "SELECT run_uuid, status FROM runs WHERE name = 'sweep seed=0,1'") == sweeps
+    assert len(list((page / "images").rglob("*.png"))) == 2
+
+
+def test_a_job_that_fails_is_shown_as_failed_with_its_error_and_so_is_its_sweep(pair: list[Config]) -> None:
+    outputs = pair[0].paths.outputs
+    broken = dataclasses.replace(pair[1], device="cuda:9")
+
+    def sweep() -> None:
+        with ledger(pair, ["seed=0,1"]):
+            train(pair[0])
+            train(broken)
+
+    with pytest.raises(ConfigError, match="no CUDA device"):
+        sweep()
+    states = dict(rows(outputs, "SELECT name, status FROM runs"))
+    assert sorted(states.values()) == ["FAILED", "FAILED", "FINISHED"]
+    errors = tags(outputs, "error")
+    assert "1 of 2 runs failed" in errors.pop("sweep seed=0,1")
+    ((name, error),) = errors.items()
+    assert "no CUDA device" in error
+    assert f"**{name} failed**: {error}" in tags(outputs, "mlflow.note.content")["sweep seed=0,1"]
+    assert len(set(tags(outputs, "mlflow.parentRunId").values())) == 1
+
+
+@pytest.mark.parametrize("how", ["exit", "terminated", "interrupted"])
+def test_a_sweep_that_is_cut_short_is_closed(pair: list[Config], how: str) -> None:
+    def sweep() -> None:
+        with ledger(pair, ["seed=0,1"]):
+            if how == "exit":
+                sys.exit(3)
+            os.kill(os.getpid(), signal.SIGTERM if how == "terminated" else signal.SIGINT)
+            signal.pause()
+
+    with pytest.raises((SystemExit, KeyboardInterrupt)):
+        sweep()
+    (folder,) = Path(pair[0].paths.outputs, "sweeps").glob("sweep-*")
+    commit = read_commit(folder)
+    assert commit is not None
+    assert commit.status == "KILLED"
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_a_larger_sweep_takes_the_runs_of_a_smaller_one_over(pair: list[Config], tiny: Compose) -> None:
+    with ledger(pair, ["seed=0,1"]):
+        pass
+    small = {read_commit(path).parent for path in Path(pair[0].paths.outputs, "runs").iterdir()}  # type: ignore[union-attr]
+    with ledger([*pair, tiny(*SHORT, "seed=2")], ["seed=0,1,2"]):
+        pass
+    large = {read_commit(path).parent for path in Path(pair[0].paths.outputs, "runs").iterdir()}  # type: ignore[union-attr]
+    assert len(small) == len(large) == 1
+    assert small != large
+
+
+def test_a_sweep_that_is_not_tracked_leaves_nothing_but_its_runs(tiny: Compose) -> None:
+    config = tiny()
+    with ledger([config, tiny("seed=1")], ["seed=0,1"]):
+        pass
+    assert not list(Path(config.paths.outputs).iterdir())
