@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.stats
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rliable import metrics
 
@@ -96,6 +96,7 @@ def column(scores: Scores) -> Scores:
     return scores[:, np.newaxis]
 
 
+@settings(deadline=None)
 @given(SCORES, SCORES)
 def test_the_probability_of_improvement_is_rliables_and_the_share_of_won_pairs(
     scores: list[float], others: list[float]
@@ -162,6 +163,7 @@ def test_a_bootstrap_of_nothing_is_refused() -> None:
 VALUES = st.lists(st.floats(-1e6, 1e6).map(lambda value: round(value, 1)), min_size=2, max_size=8)
 
 
+@settings(deadline=None)
 @given(VALUES, VALUES)
 def test_a_difference_is_scipys_welch(seeds: list[float], others: list[float]) -> None:
     found = difference(seeds, others)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from atlantis_exp.commands.app import run_verb
 from atlantis_exp.config import CompareConfig, ConfigError, digest, flatten, to_dict
@@ -82,9 +83,9 @@ def _print(comparison: "Comparison") -> None:
     for column in table.columns[1:]:
         column.justify = "right"
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(Text, row))
     console = Console(highlight=False)
-    console = Console(highlight=False, width=max(console.width, 130))
+    console = Console(highlight=False, width=max(console.width, 160))
     console.print(table)
     for note in comparison.notes:
         console.print(f"- {note}", markup=False)

@@ -56,7 +56,7 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
             drawn[f"learning_{axis}"] = _render(
                 partial(_learning, comparison=comparison, axis=axis, rows=rows),
                 f"Learning at {view}",
-                f"Training score, mean of 100 episodes, by {_UNITS[axis]}; at the end of the shortest run: "
+                f"Training score, mean of 100 episodes, by {_UNITS[axis]}; at last, while all runs of a group go on: "
                 + _said(groups, rows, "score"),
             )
             if axis == "frames":

@@ -297,10 +297,12 @@ def _verdict(views: Table, groups: Groups) -> str:
     elif main["more_seeds"] is None:
         said = f"Not decided: {main['leader']} is ahead of {main['other']} by {gap}, too little for any number of seeds"
     else:
-        said = (
-            f"Not decided: {main['leader']} is ahead of {main['other']} by {gap}; "
-            f"about {main['more_seeds']} more seeds each would decide a difference of this size"
+        more = (
+            f"one seed says nothing of the next, so at least {main['more_seeds']} more seeds each are needed"
+            if np.isnan(main["low"])
+            else f"about {main['more_seeds']} more seeds each would decide a difference of this size"
         )
+        said = f"Not decided: {main['leader']} is ahead of {main['other']} by {gap}; {more}"
     sides = defaultdict(list)
     for view in fair:
         sides[view["leader"]].append(f"{view['view']}{'' if view['decided'] else ' (not decided)'}")
