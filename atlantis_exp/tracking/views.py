@@ -28,8 +28,7 @@ NOTE = """\
 **Does network B play Atlantis better than network A, and how sure is that?**
 
 - Two views are prepared (share key in the address): **Start here** has a line a run, the best evaluation first, and
-  **Sweep** has a line a group of runs that differ only in their seed, their mean with its range, and the sweeps'
-  own figures.
+  **Sweep** has a line a group of runs that differ only in their seed: their mean, with its range.
 - A run's name says what differs from the defaults: network, samplers, seed, then the rest. Blues are DQNCnn, reds
   ResNetDQN, paler ones sample otherwise than uniformly; grey is the random player.
 - `score/` is the training's own play, with the exploration that `actions/epsilon` shows. `evaluation/` is what counts:
@@ -94,16 +93,13 @@ def _sweep() -> dict[str, Any]:
         _line("score", "score/mean_100"),
         _line("evaluation", "evaluation/mean"),
         _bar("evaluation", "evaluation/interquartile_mean"),
-        # Groups have no pictures of their own: these are of the sweeps, which are in none of them.
-        _images("pictures", "sweep/curves", "sweep/scores"),
     ]
     return {
         **_page(SWEEP, charts),
         "groupBy": {"aggregateFunction": "average", "groupByKeys": [{"mode": "tag", "groupByData": "group"}]},
-        "groupsExpanded": {"tag.group": True},  # of the runs that are in no group: while collapsed they show nothing
         "useGroupedValuesInCharts": True,
         "orderByKey": "metrics.`evaluation/interquartile_mean`",
-        "searchFilter": "tags.`atlantis.kind` LIKE 'training%'",
+        "searchFilter": "tags.`atlantis.kind` = 'training'",
     }
 
 
