@@ -2,13 +2,14 @@
 
 from itertools import count
 from pathlib import Path
-
-import numpy as np
-import numpy.typing as npt
+from typing import TYPE_CHECKING
 
 from atlantis_exp.commands.app import run_verb
 from atlantis_exp.config import PlayConfig, to_dict
 from atlantis_exp.faults import Fault
+
+if TYPE_CHECKING:
+    from atlantis_exp.game.preprocessing import Pixels
 
 
 class Window:
@@ -36,7 +37,7 @@ class Window:
         self._steps_per_second = steps_per_second
         self.closed = False
 
-    def choose(self, screen: npt.NDArray[np.uint8]) -> int:
+    def choose(self, screen: "Pixels") -> int:
         """Show a screen, (210, 160, 3) uint8, for one step; the action of the keys pressed meanwhile or still."""
         pygame = self._pygame
         picture = pygame.surfarray.make_surface(screen.swapaxes(0, 1))
