@@ -374,7 +374,8 @@ def test_the_description_says_how_the_run_stands_and_what_its_last_evaluation_wa
     tiny: Compose, started: Start, tmp_path: Path
 ) -> None:
     def notes() -> list[str]:
-    X
+        tags = [record.values for _, record in read(tmp_path) if isinstance(record, Tags)]
+        return [values[NOTE] for values in tags if NOTE in values]
 
     trainer = started(tiny(), tmp_path)
     trainer.about = "Continue with: x"
