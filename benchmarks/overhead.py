@@ -52,10 +52,10 @@ class Timed:
     def __getattr__(self, name: str) -> Any:
         method = getattr(self.tracker, name)
 
-        def timed(*arguments: Any) -> Any:
+        def timed(*arguments: Any, **options: Any) -> Any:
             began = time.perf_counter()
             try:
-                return method(*arguments)
+                return method(*arguments, **options)
             finally:
                 self.seconds += time.perf_counter() - began
 

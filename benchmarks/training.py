@@ -9,6 +9,8 @@ way before it is measured, and rests while the others have their turns. Stable-B
 
 import argparse
 import functools
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -179,11 +181,24 @@ CONTESTANTS: dict[str, Program] = {
 }
 
 
-def contest(programs: dict[str, Program], rounds: int, seconds: float) -> dict[str, list[float]]:
-    """The rates of programs that all live at once and work in turns."""
+@contextmanager
+def neighbours(count: int) -> Iterator[None]:
+    """Processes that want a core each, all the time."""
+    busy = [subprocess.Popen((sys.executable, "-c", "while True: pass")) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+
+
+def contest(programs: dict[str, Program], rounds: int, seconds: float, busy: int) -> dict[str, list[float]]:
+    """The rates of programs that all live at once and work in turns, beside busy neighbours."""
     with ExitStack() as stack:
         contestants = {name: stack.enter_context(Contestant(program)) for name, program in programs.items()}
         turns = {name: functools.partial(one.measure, seconds) for name, one in contestants.items()}
+        stack.enter_context(neighbours(busy))
         return take_turns(turns, rounds)
 
 
@@ -195,11 +210,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--fills", nargs="*", type=int, default=[10_000, 100_000, 1_000_000], help="transitions")
     parser.add_argument("--rounds", type=int, default=5, help="turns of each contestant")
     parser.add_argument("--seconds", type=float, default=10.0, help="length of a turn")
+    parser.add_argument("--neighbours", type=int, default=0, help="other programs that want a core each")
     parser.add_argument("--play-steps", type=int, default=20_000, help="random play that the fills repeat")
     args = parser.parse_args(arguments)
 
     def run(title: str, programs: dict[str, Program]) -> dict[str, list[float]]:
-        rates = contest(programs, args.rounds, args.seconds)
+        rates = contest(programs, args.rounds, args.seconds, args.neighbours)
         if rates:
             print_rates(title, "steps/s", rates)
         return rates
@@ -216,7 +232,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         {str(count): functools.partial(ours_filled, count, args.play_steps) for count in args.fills},
     )
 
-    results: dict[str, Any] = {}
+    results: dict[str, Any] = {"neighbours": args.neighbours}
     for key, name, other in (
         ("vs_sb3_16", "ours_16", "sb3_16"),
         ("vs_sb3_1", "ours_1", "sb3_1"),

@@ -2,6 +2,7 @@
 
 import atexit
 import multiprocessing
+import os
 import signal
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
@@ -146,9 +147,9 @@ class ProcessEmulators(Emulators):
         self._connections: list[Connection[Any, Any]] = []
         self._processes: list[multiprocessing.context.SpawnProcess] = []
         atexit.register(self.close)  # multiprocessing's own exit waits for workers that are deaf to its SIGTERM
-        for envs in self._envs:
+        for worker, envs in enumerate(self._envs):
             connection, theirs = context.Pipe()
-            process = context.Process(target=_work, args=(theirs, make, envs, memory, row), daemon=True)
+            process = context.Process(target=_work, args=(worker, theirs, make, envs, memory, row), daemon=True)
             process.start()
             theirs.close()  # the worker now holds the only other end, so its death ends the pipe
             self._connections.append(connection)
@@ -209,7 +210,15 @@ def _play(emulators: dict[int, Emulator], rows: Rows, method: str, calls: Calls)
     return returned
 
 
+def _stay(worker: int) -> None:
+    """Keeps this process on one core: woken together, workers else begin on the core of whoever wakes them."""
+    if hasattr(os, "sched_setaffinity"):  # Linux
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {cores[worker % len(cores)]})
+
+
 def _work(
+    worker: int,
     connection: "Connection[Any, Any]",
     make: Callable[[], Emulator],
     envs: Iterable[int],
@@ -220,6 +229,7 @@ def _work(
     for number in _FOR_THE_PARENT:
         signal.signal(number, signal.SIG_IGN)
     cv2.setNumThreads(1)
+    _stay(worker)
     try:
         emulators = {env: make() for env in envs}
         rows = np.frombuffer(memoryview(memory), row)

@@ -259,3 +259,13 @@ def test_workers_import_nothing_but_this_wing() -> None:
         f"atlantis_exp.game.{room}" for room in ("preprocessing", "emulator", "vector")
     }
     assert not {"torch", "mlflow", "hydra", "omegaconf", "matplotlib"} & set(modules)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs Linux")
+def test_workers_stay_on_a_core_each() -> None:
+    with make_emulators(make, 3, workers=3) as emulators:
+        assert isinstance(emulators, ProcessEmulators)
+        emulators.reset(range(3))
+        cores = [os.sched_getaffinity(process.pid or 0) for process in emulators._processes]
+    mine = sorted(os.sched_getaffinity(0))
+    assert cores == [{mine[worker % len(mine)]} for worker in range(3)]
