@@ -309,4 +309,4 @@ def _references(axes: "Axes", comparison: Comparison) -> None:
         axes.annotate(f"{score:,.0f}", (score, y), (4, 0), textcoords="offset points", va="center", fontsize=7)
     axes.margins(x=0.12)
     _thousands(axes.xaxis)
-    axes.set_xlabel("mean score (logarithmic); conditions differ, see the table")
+    axes.set_xlabel("mean score (logarithmic)")
