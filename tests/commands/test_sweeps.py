@@ -94,6 +94,8 @@ def test_a_job_that_fails_is_shown_as_failed_with_its_error_and_so_is_its_sweep(
 
 @pytest.mark.parametrize("how", ["exit", "terminated", "interrupted"])
 def test_a_sweep_that_is_cut_short_is_closed(pair: list[Config], how: str) -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background job lacks
+
     def sweep() -> None:
         with ledger(pair, ["seed=0,1"]):
             if how == "exit":
@@ -103,6 +105,7 @@ def test_a_sweep_that_is_cut_short_is_closed(pair: list[Config], how: str) -> No
 
     with pytest.raises((SystemExit, KeyboardInterrupt)):
         sweep()
+    signal.signal(signal.SIGINT, before)
     (folder,) = Path(pair[0].paths.outputs, "sweeps").glob("sweep-*")
     commit = read_commit(folder)
     assert commit is not None
