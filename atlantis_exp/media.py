@@ -19,6 +19,7 @@ SCORE_RANGE = (1e3, 1e6)  # the axis of every histogram, so that runs and steps 
 BINS = 30  # as in report figure 3.1
 COLUMNS = 40  # of a heat map: windows of the training
 BLACK, BLUE, ORANGE, GREEN, VERMILLION, GREY = "#000000", "#0072B2", "#E69F00", "#009E73", "#D55E00", "#999999"
+PURPLE, SKY = "#CC79A7", "#56B4E9"
 """Colours that people with any colour vision tell apart (Okabe and Ito, 2008)."""
 
 
@@ -163,7 +164,7 @@ def film(pictures: Iterable[npt.NDArray[np.uint8]], frames_per_second: float) ->
 def run_colour(player: str, sampler: str | None = None) -> str:
     """The colour of a run wherever it is drawn, as #rrggbb: the player's own, paler for other samplers than uniform."""
     own = {"cnn": BLUE, "resnet": VERMILLION, "random": GREY, "constant": BLACK}
-    rest = (GREEN, ORANGE, "#CC79A7", "#56B4E9")
+    rest = (GREEN, ORANGE, PURPLE, SKY)
     colour = _rgb(own.get(player) or rest[zlib.crc32(player.encode()) % len(rest)])
     if sampler not in (None, "uniform"):
         colour = tuple(round(255 - 0.55 * (255 - channel)) for channel in colour)

@@ -11,6 +11,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from atlantis_exp.commands.runs import all_runs
+from atlantis_exp.media import BLUE, VERMILLION
 from atlantis_exp.tracking.journal import Metrics, read, read_commit
 
 PANELS = {
@@ -19,7 +20,7 @@ PANELS = {
     "learning/loss": "loss",
     "learning/gradient_norm": "norm of the gradient",
 }
-COLOURS = {"bf16": "#0072b2", "fp32": "#d55e00"}
+COLOURS = {"bf16": BLUE, "fp32": VERMILLION}
 
 
 def main(outputs: Path) -> None:

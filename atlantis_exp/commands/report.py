@@ -12,6 +12,7 @@ from atlantis_exp.config import ReportConfig
 def report(config: ReportConfig) -> None:
     """Print every run's evaluation, and how to look further."""
     from atlantis_exp.commands.runs import all_runs, settle
+    from atlantis_exp.statistics import TABLE_COLUMNS
 
     outputs = Path(config.paths.outputs)
     settle(outputs)
@@ -30,11 +31,10 @@ def report(config: ReportConfig) -> None:
             table.add_row(run.name, run.state if result is None else f"{result.steps:,}")
             continue
         scores = {key.split("/")[1]: value for key, value in result.evaluation.items() if key.startswith("evaluation/")}
-        points = ("mean", "standard_error", "median", "interquartile_mean", "high", "low")
         table.add_row(
             run.name,
             f"{result.steps:,}",
-            *(f"{scores[point]:,.0f}" for point in points),
+            *(f"{scores[point]:,.0f}" for point in TABLE_COLUMNS),
             f"{result.evaluation['actions/random_share']:.1%}",
             f"{scores['episodes']:.0f}",
         )

@@ -18,10 +18,10 @@ from atlantis_exp.commands.titles import colour, group, title
 from atlantis_exp.config import Config, digest
 from atlantis_exp.faults import Fault
 from atlantis_exp.media import curves, strips
+from atlantis_exp.statistics import TABLE_COLUMNS
 from atlantis_exp.tracking.journal import Journal, JournalError, Metrics, Status, adopt, read, read_commit
 
 _PAGE_SECONDS = 60.0  # between two looks at the runs while they are trained
-_POINTS = ("mean", "standard_error", "median", "interquartile_mean", "high", "low")
 
 
 @contextmanager
@@ -132,8 +132,10 @@ def _describe(journal: Journal, configs: Sequence[Config], folders: Sequence[Run
     for config, folder in zip(configs, folders, strict=True):
         row = [title(config), folder.state]
         if (result := folder.result) is not None:
-            scores = [f"{result.evaluation[f'evaluation/{point}']:,.0f}" for point in _POINTS if result.evaluation]
-            row += [f"{result.steps:,}", *(scores or [""] * len(_POINTS)), f"{result.counts['hours']:.2f}"]
+            scores = [
+                f"{result.evaluation[f'evaluation/{point}']:,.0f}" for point in TABLE_COLUMNS if result.evaluation
+            ]
+            row += [f"{result.steps:,}", *(scores or [""] * len(TABLE_COLUMNS)), f"{result.counts['hours']:.2f}"]
         lines.append(f"| {' | '.join(row + [''] * (len(head) - len(row)))} |")
         if folder.state == "failed":
             failures.append(f"**{title(config)} failed**: {folder.error}")

@@ -18,16 +18,13 @@ def page(comparison: Comparison, figures: Mapping[str, Drawn], facts: Mapping[st
     )
 
 
+_SCORES = {"episodes": "episodes", "iqm": "IQM", "mean": "mean", "median": "median", "low": "low", "high": "high"}
+
 COLUMNS = {
     "evaluation": {
         "group": "group",
         "runs": "runs",
-        "episodes": "episodes",
-        "iqm": "IQM",
-        "mean": "mean",
-        "median": "median",
-        "low": "low",
-        "high": "high",
+        **_SCORES,
         "score_per_1000_steps": "score / 1,000 steps",
         "time_cap_share": "at time cap",
         "human_normalised_mean": "human-normalised",
@@ -52,12 +49,7 @@ COLUMNS = {
         "hours": "hours",
         "flops": "FLOPs",
         "epsilon": "epsilon",
-        "episodes": "episodes",
-        "iqm": "IQM",
-        "mean": "mean",
-        "median": "median",
-        "low": "low",
-        "high": "high",
+        **_SCORES,
     },
     "actions": {"group": "group", "action": "action", "network": "network", "random": "chance"},
     "references": {"name": "player", "score": "score", "protocol": "protocol", "source": "source"},

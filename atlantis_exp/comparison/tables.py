@@ -24,6 +24,7 @@ from atlantis_exp.statistics import (
     interval,
     probability_of_improvement,
     resample,
+    summarize,
 )
 
 Row = dict[str, Any]
@@ -73,7 +74,7 @@ def compare(gathered: Gathered, groups: Groups, by: Sequence[str], resamples: in
         "published_curves": [row for row in published("curves") if row["frames"] <= frames],
         "skipped": [{"run": name, "reason": reason} for name, reason in gathered.skipped.items()],
     }
-    notes = _notes(groups, by, views, evaluation, players, frames)
+    notes = _notes(groups, by, views, evaluation, random_line(tables["references"]), frames)
     return Comparison(list(groups), list(by), _verdict(views, groups), notes, tables)
 
 
@@ -134,7 +135,7 @@ def _evaluation(label: str, runs: Sequence[Training], samples: Sequence[Scores])
 
 
 def _run(label: str, training: Training) -> Row:
-    scores = training.episodes.scores
+    summary = summarize(training.episodes.scores)
     last = {axis: training.curve[axis][-1] if axis in training.curve else "" for axis in AXES}
     return {
         "run": training.name,
@@ -142,12 +143,12 @@ def _run(label: str, training: Training) -> Row:
         "seed": training.config["seed"],
         **last,
         "epsilon": training.config["evaluation.epsilon"],
-        "episodes": scores.size,
-        "iqm": interquartile_mean(scores),
-        "mean": float(scores.mean()),
-        "median": float(np.median(scores)),
-        "low": float(scores.min()),
-        "high": float(scores.max()),
+        "episodes": summary.episodes,
+        "iqm": summary.interquartile_mean,
+        "mean": summary.mean,
+        "median": summary.median,
+        "low": summary.low,
+        "high": summary.high,
     }
 
 
@@ -312,7 +313,7 @@ def _verdict(views: Table, groups: Groups) -> str:
 
 
 def _notes(
-    groups: Groups, by: Sequence[str], views: Table, evaluation: Table, players: Sequence[Player], frames: float
+    groups: Groups, by: Sequence[str], views: Table, evaluation: Table, random_player: Row, frames: float
 ) -> list[str]:
     """What a reader must know before believing the tables."""
     notes = []
@@ -352,13 +353,12 @@ def _notes(
             for run in runs
             if (run.episodes.scores == _HELD).all()
         ]
-    measured = random_line([_measured(player) for player in players] + published("scores"))
-    if measured["protocol"].startswith("published"):
+    if random_player["protocol"].startswith("published"):
         notes.append(
             "No random player was measured under these settings, so a published one stands for it; "
             "python -m atlantis_exp baseline with the same env measures one."
         )
-    if frames <= EARLY_FRAMES and any(row["iqm"] < measured["score"] for row in evaluation):
+    if frames <= EARLY_FRAMES and any(row["iqm"] < random_player["score"] for row in evaluation):
         notes.append(early_dqn())
     return notes
 

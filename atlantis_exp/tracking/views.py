@@ -8,6 +8,8 @@ import json
 import zlib
 from typing import Any
 
+from atlantis_exp.tracking.journal import NOTE
+
 _SECTIONS = {  # cards a row, and their height in pixels
     "score": (2, 360),
     "pictures": (1, 520),
@@ -24,7 +26,7 @@ _COLUMNS = (
 START, SWEEP = "start", "sweep"
 """The keys of the shared views, as `viewStateShareKey` in an address takes them."""
 
-NOTE = """\
+_ABOUT = """\
 **Does network B play Atlantis better than network A, and how sure is that?**
 
 - Two views are prepared (share key in the address): **Start here** has a line a run, the best evaluation first, and
@@ -43,7 +45,7 @@ NOTE = """\
 
 def experiment_tags() -> dict[str, str]:
     """The tags of an experiment that explain it and prepare its views."""
-    tags = {"mlflow.note.content": NOTE, "mlflow.experimentKind": "custom_model_development"}
+    tags = {NOTE: _ABOUT, "mlflow.experimentKind": "custom_model_development"}
     for key, name, state in ((START, "Start here", _start_here()), (SWEEP, "Sweep", _sweep())):
         packed = "deflate;" + base64.b64encode(zlib.compress(json.dumps(state).encode())).decode()
         view = {"name": name, "createdAt": 0, "updatedAt": 0, "state": packed}
