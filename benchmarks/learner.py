@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch.utils.flop_counter import FlopCounterMode
 
-from atlantis_exp.build import build_learner, choose_device
+from atlantis_exp.build import build_learner, choose_device, count_update_flops
+from atlantis_exp.config import Config
 from benchmarks.composition import composed
 from benchmarks.contest import calls_per_second, print_results, print_table, take_turns
 
@@ -34,31 +34,28 @@ class Case(NamedTuple):
     def name(self) -> str:
         return f"{self.model}_{self.precision}"
 
+    @property
+    def config(self) -> Config:
+        overrides = (f"training.batch_size={self.batch_size}", f"training.precision={self.precision}")
+        return composed(f"model={self.model}", *overrides)
+
 
 CASES = tuple(Case(*network, precision) for network in (("cnn", 128), ("resnet", 32)) for precision in ("bf16", "fp32"))
 
 
-def update_of(case: Case, *overrides: str) -> Callable[[], object]:
+def update_of(config: Config) -> Callable[[], object]:
     """An update of a learner on a batch of noise; sets torch's threads to what the learner has in a training."""
-    config = composed(f"model={case.model}", f"training.precision={case.precision}", *overrides)
-    learner = build_learner(config)
+    learner, batch_size = build_learner(config), config.training.batch_size
     rng = np.random.default_rng(0)
-    states = rng.integers(0, 256, (case.batch_size, config.env.stack + 1, config.env.size, config.env.size), np.uint8)
+    states = rng.integers(0, 256, (batch_size, config.env.stack + 1, config.env.size, config.env.size), np.uint8)
     return functools.partial(
         learner.update,
         states[:, :-1],
-        rng.integers(4, size=case.batch_size),
-        np.zeros(case.batch_size, np.float32),
+        rng.integers(4, size=batch_size),
+        np.zeros(batch_size, np.float32),
         states[:, 1:],
-        np.full(case.batch_size, config.objective.gamma, np.float32),
+        np.full(batch_size, config.objective.gamma, np.float32),
     )
-
-
-def flops_of(update: Callable[[], object]) -> int:
-    """Floating point operations of the matrix products and convolutions that a call makes in this thread."""
-    with FlopCounterMode(display=False) as counter:
-        update()
-    return int(counter.get_total_flops())
 
 
 def gemm_of(precision: str) -> Callable[[], None]:
@@ -99,9 +96,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return turn
 
     for case in cases:
-        flops[f"gemm_{case.name}"], flops[case.name] = 2 * _SIDE**3, flops_of(update_of(case, "threads=1"))
+        config = case.config
+        flops[f"gemm_{case.name}"], flops[case.name] = 2 * _SIDE**3, count_update_flops(config)
         turns[f"gemm_{case.name}"] = measured(gemm_of(case.precision), threads)
-        update = update_of(case)
+        update = update_of(config)
         turns[case.name] = measured(update, torch.get_num_threads())
     calls = take_turns(turns, args.rounds)
 
