@@ -47,7 +47,8 @@ class DQN:
         online: QFunction,  # noqa: ARG002 - only Double DQN asks it
         target: QFunction,
     ) -> torch.Tensor:
-        return bootstrapped(r_t, discount, target(s_tpm).amax(1))
+        q = target(s_tpm)
+        return bootstrapped(r_t, discount, taken(q, action_values(q).argmax(1)))
 
     def losses(self, q: torch.Tensor, a_t: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         return smooth_l1_loss(taken(q, a_t), target, reduction="none")
@@ -64,27 +65,16 @@ class DoubleDQN(DQN):
     def targets(
         self, r_t: torch.Tensor, s_tpm: torch.Tensor, discount: torch.Tensor, online: QFunction, target: QFunction
     ) -> torch.Tensor:
-        a_tpm = online(s_tpm).argmax(1)
+        a_tpm = action_values(online(s_tpm)).argmax(1)
         return bootstrapped(r_t, discount, taken(target(s_tpm), a_tpm))
 
 
 @dataclass(frozen=True)
-class Quantile:
+class Quantile(DQN):
     """QR-DQN: N quantiles of the return, whose mean is the value (Dabney et al. 2018, algorithm 1, kappa 1).
 
     The target network chooses the next action by their mean and gives its quantiles.
     """
-
-    def targets(
-        self,
-        r_t: torch.Tensor,
-        s_tpm: torch.Tensor,
-        discount: torch.Tensor,
-        online: QFunction,  # noqa: ARG002 - only Double DQN asks it
-        target: QFunction,
-    ) -> torch.Tensor:
-        z_BAN = target(s_tpm)
-        return bootstrapped(r_t[:, None], discount[:, None], taken(z_BAN, action_values(z_BAN).argmax(1)))
 
     def losses(self, q: torch.Tensor, a_t: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Return the quantile Huber loss of each sample, (B,): a sum over its quantiles, a mean over the target's."""
@@ -108,5 +98,7 @@ def taken(q: torch.Tensor, a_t: torch.Tensor) -> torch.Tensor:
 
 
 def bootstrapped(r_t: torch.Tensor, discount: torch.Tensor, v_tpm: torch.Tensor) -> torch.Tensor:
-    """Return rewards plus discounted values, and whatever these are, rewards alone where the discount is 0."""
+    """Return rewards plus discounted values (B,) or quantiles (B, N), and whatever these are, rewards alone where the
+    discount is 0."""
+    r_t, discount = (each.view(-1, *(1 for _ in v_tpm.shape[1:])) for each in (r_t, discount))
     return torch.where(discount == 0, r_t, r_t + discount * v_tpm)
