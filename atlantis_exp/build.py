@@ -205,6 +205,7 @@ def build_plan(config: cfg.Config) -> Plan:
         epsilon=build_schedule(config.epsilon),
         learning_rate=build_schedule(config.lr_schedule),
         returns=Returns(objective.gamma, objective.n_step, objective.reward_scale, objective.reward_clip),
+        terminal_on_life_loss=objective.terminal_on_life_loss,
         learn_every=config.training.learn_every,
         learn_start=config.training.learn_start,
         batch_size=config.training.batch_size,

@@ -59,32 +59,33 @@ class EnvConfig:
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
-class CnnConfig:
+class _NetworkConfig:
+    name: str
+    input_size: Size  # pixels
+    head: Literal["plain", "dueling", "quantile"]
+
+
+@dataclass(config=_STRICT, kw_only=True, frozen=True)
+class CnnConfig(_NetworkConfig):
     """DQNCnn, report figure 2.1."""
 
     name: Literal["cnn"]
-    input_size: Size  # pixels
-    head: Literal["plain", "dueling", "quantile"]
     smallest: ClassVar[int] = 36  # pixels that three unpadded convolutions need
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
-class ResNetConfig:
+class ResNetConfig(_NetworkConfig):
     """ResNetDQN, report figure 2.2."""
 
     name: Literal["resnet"]
-    input_size: Size  # pixels
-    head: Literal["plain", "dueling", "quantile"]
     smallest: ClassVar[int] = 15  # pixels that the unpadded stem needs
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
-class ResNetFastConfig:
+class ResNetFastConfig(_NetworkConfig):
     """ResNetFast, a residual network at a tenth of ResNetDQN's cost."""
 
     name: Literal["resnet_fast"]
-    input_size: Size  # pixels
-    head: Literal["plain", "dueling", "quantile"]
     smallest: ClassVar[int] = 8  # pixels that the unpadded stem needs
 
 
@@ -102,28 +103,29 @@ class TargetConfig:
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
-class DqnConfig:
-    """The bootstrap target of one value, and its loss."""
-
-    name: Literal["dqn", "double_dqn"]
+class _BootstrapConfig:
+    name: str
     gamma: Annotated[float, Field(ge=0, lt=1)]
     n_step: Count  # rewards before the bootstrap
     reward_scale: Positive
     reward_clip: Positive | None  # after scaling; null: not clipped
+    terminal_on_life_loss: bool
     target: TargetConfig
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
-class QuantileConfig:
+class DqnConfig(_BootstrapConfig):
+    """The bootstrap target of one value, and its loss."""
+
+    name: Literal["dqn", "double_dqn"]
+
+
+@dataclass(config=_STRICT, kw_only=True, frozen=True)
+class QuantileConfig(_BootstrapConfig):
     """The bootstrap target of a distribution's quantiles, and its loss."""
 
     name: Literal["quantile"]
     quantiles: Count
-    gamma: Annotated[float, Field(ge=0, lt=1)]
-    n_step: Count  # rewards before the bootstrap
-    reward_scale: Positive
-    reward_clip: Positive | None  # after scaling; null: not clipped
-    target: TargetConfig
 
 
 ObjectiveConfig = Annotated[DqnConfig | QuantileConfig, Field(discriminator="name")]

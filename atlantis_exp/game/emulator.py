@@ -23,6 +23,7 @@ class Step(NamedTuple):
     reward: float  # the game's own, never clipped
     terminated: bool
     truncated: bool
+    life_lost: bool  # fewer buildings stand than before
     frames: int  # emulated in this step
 
 
@@ -86,6 +87,7 @@ class Emulator:
             for _ in range(self._generator.integers(1, self._noop_max + 1)):
                 self._ale.act(self._actions[0])
         self._steps = 0
+        self._lives = self.lives
         self._ale.getScreen(self._screen)
         self._pool = self.preprocessing.grey(self._screen)
         return self.preprocessing.resize(self._pool)
@@ -96,7 +98,7 @@ class Emulator:
         frameskip = self._frameskip
         if not isinstance(frameskip, int):
             frameskip = int(self._generator.integers(*frameskip))
-        before = self._ale.getFrameNumber()
+        frames_before, lives_before = self._ale.getFrameNumber(), self._lives
         if self._max_pool:
             reward = self._act_and_pool(action, frameskip)
         else:
@@ -107,7 +109,15 @@ class Emulator:
         self._steps += 1
         terminated = self._ale.game_over(with_truncation=False)
         truncated = not terminated and (self._ale.game_truncated() or self._steps == self._max_steps)
-        return Step(observation, float(reward), terminated, truncated, self._ale.getFrameNumber() - before)
+        self._lives = self.lives
+        return Step(
+            observation,
+            float(reward),
+            terminated,
+            truncated,
+            self._lives < lives_before,
+            self._ale.getFrameNumber() - frames_before,
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Returns how the episode began and its actions: restored into another emulator, ALE's own state is not exact,

@@ -36,6 +36,7 @@ class Steps(NamedTuple):
     rewards: npt.NDArray[np.float64]
     terminated: npt.NDArray[np.bool_]
     truncated: npt.NDArray[np.bool_]
+    life_lost: npt.NDArray[np.bool_]
     frames: npt.NDArray[np.int64]
 
 
@@ -192,7 +193,7 @@ def make_emulators(make: Callable[[], Emulator], num_envs: int, workers: int) ->
 
 
 def _row(size: int) -> np.dtype[np.void]:
-    formats = [(np.uint8, (size, size)), np.float64, np.bool_, np.bool_, np.int64]
+    formats = [(np.uint8, (size, size)), np.float64, np.bool_, np.bool_, np.bool_, np.int64]
     return np.dtype({"names": Steps._fields, "formats": formats}, align=True)
 
 

@@ -15,7 +15,7 @@ _ENTRY_DTYPES: dict[str, type[np.generic]] = {
     "back": np.uint16,
     "action": np.uint8,
     "reward": np.float32,
-    "terminated": np.bool_,
+    "terminal": np.bool_,
 }
 _SEGMENT_DTYPES = _ENTRY_DTYPES | {"data": np.uint8, "dictionary": np.uint8, "envs": np.int64, "newest": np.int64}
 
@@ -26,7 +26,7 @@ class Returns:
 
     The memory keeps the game's rewards; the learner's are those times `scale`, then clipped to -`clip`..`clip`. They
     are summed with discount `gamma` a step. Where an episode ends or has come no further yet, the rewards are fewer
-    and what follows is discounted less; after a terminated episode nothing follows.
+    and what follows is discounted less; after a terminal step nothing follows.
     """
 
     gamma: float
@@ -47,16 +47,17 @@ class Transitions(NamedTuple):
     a_t: npt.NDArray[np.int64]  # (B,)
     r_t: npt.NDArray[np.float32]  # (B,), the discounted sum of m rewards
     s_tpm: npt.NDArray[np.uint8]  # (B, stack, H, W)
-    discount: npt.NDArray[np.float32]  # (B,), of what follows s_tpm: gamma**m, 0 where the episode has terminated
+    discount: npt.NDArray[np.float32]  # (B,), of what follows s_tpm: gamma**m, 0 after a terminal step
 
 
 class ReplayMemory:
     """The newest observations of interleaved episodes, each stored once, read as transitions.
 
-    An entry is an observation with the step that led to it: its action, reward, termination, and `back`, the distance
-    in ids to the observation before it (0: an episode's first). Entries never change once appended. A transition bears
-    the id of its state's newest observation; it is available while it has a successor and all frames of both states are
-    stored. Where a state reaches back beyond its episode, the first observation repeats (report figure 2.3, `is_new`).
+    An entry is an observation with the step that led to it: its action, reward, whether it is terminal, and `back`,
+    the distance in ids to the observation before it (0: an episode's first). Entries never change once appended. A
+    transition bears the id of its state's newest observation; it is available while it has a successor and all frames
+    of both states are stored. Where a state reaches back beyond its episode, the first observation repeats (report
+    figure 2.3, `is_new`).
 
     Args:
         capacity: most observations held; an episode of n steps has n + 1.
@@ -77,9 +78,9 @@ class ReplayMemory:
         self._forward = np.zeros(capacity, np.uint16)
         self._action = np.zeros(capacity, np.uint8)
         self._reward = np.zeros(capacity, np.float32)
-        self._terminated = np.zeros(capacity, np.bool_)
+        self._terminal = np.zeros(capacity, np.bool_)
         self._available = np.zeros(capacity, np.bool_)
-        arrays = (self._back, self._forward, self._action, self._reward, self._terminated, self._available)
+        arrays = (self._back, self._forward, self._action, self._reward, self._terminal, self._available)
         self._index_bytes = sum(array.nbytes for array in arrays)
         self._frames = FrameStore(capacity, frame_shape, budget_bytes - self._index_bytes)
         self._newest: dict[int, int] = {}  # environment -> id of its unfinished episode's newest observation
@@ -105,12 +106,12 @@ class ReplayMemory:
         return self._index_bytes + self._frames.nbytes
 
     def begin(self, env: int, observation: npt.NDArray[np.uint8]) -> None:
-        """Start an episode of environment `env`; one it had left unfinished was truncated."""
-        self._append(self._frames.encode(observation), back=0, action=0, reward=0.0, terminated=False)
+        """Start an episode of environment `env`; the one before has ended."""
+        self._append(self._frames.encode(observation), back=0, action=0, reward=0.0, terminal=False)
         self._newest[env] = self.next_id - 1
 
-    def add(self, env: int, action: int, reward: float, observation: npt.NDArray[np.uint8], terminated: bool) -> None:
-        """Append the step of environment `env` that led to `observation`.
+    def add(self, env: int, action: int, reward: float, observation: npt.NDArray[np.uint8], terminal: bool) -> None:
+        """Append the step of environment `env` that led to `observation`; nothing after a terminal one counts for it.
 
         Raises:
             ValueError: `env` has no episode under way, or all others together have appended more than 65,534
@@ -121,11 +122,8 @@ class ReplayMemory:
         back = self.next_id - self._newest[env]
         if back > _MAX_BACK:
             raise ValueError(f"environment {env} was idle for {back - 1:,} observations: begin a new episode")
-        self._append(self._frames.encode(observation), back, action, reward, terminated)
-        if terminated:
-            del self._newest[env]
-        else:
-            self._newest[env] = self.next_id - 1
+        self._append(self._frames.encode(observation), back, action, reward, terminal)
+        self._newest[env] = self.next_id - 1
 
     def draw(self, count: int, rng: np.random.Generator) -> npt.NDArray[np.int64]:
         """Draw `count` ids uniformly, with replacement, from the available transitions.
@@ -171,6 +169,7 @@ class ReplayMemory:
         steps = np.ones(len(ids), np.int64)
         for _ in range(returns.n_step - 1):
             forward = self._forward[last % self.capacity]  # 0 at the end of what is known of an episode
+            forward = np.where(self._terminal[last % self.capacity], 0, forward)
             last = last + forward
             reward = returns.reward(self._reward[last % self.capacity])
             r_t += np.where(forward > 0, returns.gamma**steps * reward, 0.0)
@@ -178,13 +177,13 @@ class ReplayMemory:
         now, then = self._state(ids), self._state(last)
         # A step apart, two states have all frames but one in common.
         frames = self._frames.decode(np.hstack((now, then[:, -1:] if returns.n_step == 1 else then)))
-        terminated = self._terminated[last % self.capacity]
+        terminal = self._terminal[last % self.capacity]
         return Transitions(
             s_t=frames[:, : self.stack],
             a_t=self._action[first % self.capacity].astype(np.int64),
             r_t=r_t.astype(np.float32),
             s_tpm=frames[:, -self.stack :],
-            discount=np.where(terminated, 0.0, returns.gamma**steps).astype(np.float32),
+            discount=np.where(terminal, 0.0, returns.gamma**steps).astype(np.float32),
         )
 
     def segment(self, since: int) -> dict[str, Any]:
@@ -210,7 +209,7 @@ class ReplayMemory:
             "back": self._back[slots],
             "action": self._action[slots],
             "reward": self._reward[slots],
-            "terminated": self._terminated[slots],
+            "terminal": self._terminal[slots],
             "envs": np.array(list(self._newest), np.int64),
             "newest": np.array(list(self._newest.values()), np.int64),
         }
@@ -269,14 +268,12 @@ class ReplayMemory:
         for holds, invariant in (
             (np.all(back <= ids), "no observation comes before id 0"),
             (len(np.unique(previous)) == len(previous), "an observation has one successor at most"),
-            (not np.any(self._terminated[slots[previous]]), "a terminated episode does not continue"),
             (np.array_equal(forward, self._forward[slots]), "forward mirrors back"),
             (np.array_equal(available, self._available[slots]), "available transitions are those wholly stored"),
             (np.count_nonzero(available) == len(self), "the length is the number of available transitions"),
             (len(set(self._newest.values())) == len(self._newest), "no observation belongs to two environments"),
             (np.all(newest < self.next_id), "an environment's newest observation has been seen"),
             (not np.any(self._forward[newest % self.capacity]), "an environment's newest observation has no successor"),
-            (not np.any(self._terminated[newest % self.capacity]), "an episode under way has not terminated"),
         ):
             if not holds:
                 raise ValueError(f"replay memory is not valid: {invariant}")
@@ -286,7 +283,7 @@ class ReplayMemory:
         self._newest = {}
         self._num_available = 0
 
-    def _append(self, data: bytes | memoryview, back: int, action: int, reward: float, terminated: bool) -> None:
+    def _append(self, data: bytes | memoryview, back: int, action: int, reward: float, terminal: bool) -> None:
         oldest_id = self.oldest_id
         self._frames.append(data)
         for evicted in range(oldest_id, self.oldest_id):
@@ -297,7 +294,7 @@ class ReplayMemory:
         self._forward[slot] = 0
         self._action[slot] = action
         self._reward[slot] = reward
-        self._terminated[slot] = terminated
+        self._terminal[slot] = terminal
         self._available[slot] = False
         if back and k - back >= self.oldest_id:
             previous = (k - back) % self.capacity

@@ -17,6 +17,7 @@ from atlantis_exp.learning.schedules import Schedule
 from atlantis_exp.media import score_heatmap, score_histogram
 from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.replay.samplers import Sampler
+from atlantis_exp.statistics import TABLE_COLUMNS
 from atlantis_exp.tracking.journal import Tracker
 from atlantis_exp.training.actor import Actor, Decisions
 from atlantis_exp.training.checkpoint import Checkpoints
@@ -64,6 +65,7 @@ class Plan:
     epsilon: Schedule
     learning_rate: Schedule  # share of the phase's
     returns: Returns
+    terminal_on_life_loss: bool  # for what is learned; the episode goes on
     learn_every: int  # steps
     learn_start: int  # transitions in the memory
     batch_size: int  # transitions
@@ -307,13 +309,14 @@ class Trainer:
 
     def _observe(self, decisions: Decisions, steps: Steps) -> None:
         self.stack.push(steps.observations)
+        terminal = steps.terminated | (steps.life_lost & self.plan.terminal_on_life_loss)
         for env in range(self.emulators.num_envs):
             self.memory.add(
                 env,
                 int(decisions.actions[env]),
                 float(steps.rewards[env]),
                 steps.observations[env],
-                bool(steps.terminated[env]),
+                bool(terminal[env]),
             )
         self.counters.steps += self.emulators.num_envs
         self.counters.frames += int(steps.frames.sum())
@@ -405,8 +408,7 @@ class Trainer:
             f"{self.learner.updates:,} updates, {now.seconds / 3600:.2f} hours",
         ]
         if reached:
-            points = ("mean", "standard_error", "median", "interquartile_mean", "high", "low")
-            scores = " | ".join(f"{reached[f'evaluation/{point}']:,.0f}" for point in points)
+            scores = " | ".join(f"{reached[f'evaluation/{point}']:,.0f}" for point in TABLE_COLUMNS)
             lines += [
                 "| evaluated at step | mean | +- | median | IQM | high | low | epsilon | episodes | random |\n"
                 f"|{' ---: |' * 10}\n| {self.evaluated_at:,} | {scores} | {reached['evaluation/epsilon']} | "

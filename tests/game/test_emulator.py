@@ -52,13 +52,16 @@ def play_beside_gymnasium(
     for episode_seed in (seed, None):
         theirs, info = env.reset(seed=episode_seed)
         np.testing.assert_array_equal(first_view(ours.reset(episode_seed)), theirs)
+        lives = info["lives"]
         ended = False
         while not ended:
             action, frames_before = act(), info["frame_number"]
             step = ours.step(action)
             theirs, reward, terminated, truncated, info = env.step(action)
-            assert step[1:] == (reward, terminated, truncated, info["frame_number"] - frames_before)
+            frames = info["frame_number"] - frames_before
+            assert step[1:] == (reward, terminated, truncated, info["lives"] < lives, frames)
             assert ours.lives == info["lives"]
+            lives = info["lives"]
             assert np.array_equal(view(step.observation), theirs)
             ended = terminated or truncated
         assert np.array_equal(ours.screen_rgb(), env.get_wrapper_attr("ale").getScreenRGB())

@@ -11,7 +11,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from atlantis_exp.build import build_trainer
+from atlantis_exp.build import build_trainer, make_emulator
 from atlantis_exp.config import Config
 from atlantis_exp.game.vector import WorkerDied
 from atlantis_exp.replay.memory import ReplayMemory, Returns
@@ -284,7 +284,7 @@ def test_a_collapsed_policy_is_tagged_and_told(tiny: Compose, tmp_path: Path) ->
 def test_a_truncated_episode_bootstraps_and_a_terminated_one_does_not(
     tiny: Compose, started: Start, tmp_path: Path
 ) -> None:
-    config = tiny(
+    game = (
         "env=atlantis_v5",
         "env.size=40",
         "env.max_steps=430",
@@ -294,18 +294,27 @@ def test_a_truncated_episode_bootstraps_and_a_terminated_one_does_not(
         "evaluation.at_end=false",
         "evaluation.every_steps=null",
     )
-    trainer = started(config, tmp_path)
+    trainer = started(tiny(*game), tmp_path)
     trainer.actor = ConstantActor(0)  # a game of NOOPs lasts 423 steps
     trainer.run(after(423))
     assert [score for _, score in curve(tmp_path, "score/episode")] == [2_000]
-    ends = trainer.memory.state_dict()["terminated"]
+    ends = trainer.memory.state_dict()["terminal"]
     assert np.flatnonzero(ends).tolist() == [423]
+
+    mortal = started(tiny(*game, "objective.terminal_on_life_loss=true"), tmp_path / "lives")
+    mortal.actor = ConstantActor(0)
+    emulator = make_emulator(tiny(*game).env)()
+    emulator.reset(mortal.seeds[0])
+    losses = [step for step in range(1, 424) if emulator.step(0).life_lost]
+    mortal.run(after(423))
+    assert len(losses) > 3
+    assert np.flatnonzero(mortal.memory.state_dict()["terminal"]).tolist() == [*losses, 423]  # the game is over later
 
     truncated = started(tiny("env.max_steps=40", "training.learn_start=114"), tmp_path / "truncated")
     truncated.run(after(100))
     assert [length for _, length in curve(tmp_path / "truncated", "score/length")] == [40, 40]
     state = truncated.memory.state_dict()
-    assert not state["terminated"].any()
+    assert not state["terminal"].any()
     assert np.flatnonzero(state["back"] == 0).tolist() == [0, 41, 82]  # observations that begin an episode
 
 
@@ -401,7 +410,7 @@ def test_a_plan_in_episodes_ends_with_its_last_episode(tiny: Compose, started: S
 
 def test_the_phase_at_a_boundary_is_the_one_that_begins_there() -> None:
     phases = [Phase("a", 2, 0.1, None), Phase("b", 1, 0.2, None)]  # type: ignore[arg-type]
-    plan = Plan("steps", phases, lambda *_: 0.0, lambda *_: 1.0, Returns(0.9), 1, 0, 1)
+    plan = Plan("steps", phases, lambda *_: 0.0, lambda *_: 1.0, Returns(0.9), False, 1, 0, 1)
     assert [plan.phase_at(done).name for done in (0, 1, 2, 3, 9)] == ["a", "a", "b", "b", "b"]
 
 
