@@ -95,8 +95,18 @@ def make_emulator(env: cfg.EnvConfig) -> partial[Emulator]:
 
 def build_emulators(env: cfg.EnvConfig, num_envs: int) -> Emulators:
     """`num_envs` emulators, one of them in this process, more in worker processes."""
-    workers = env.workers or len(os.sched_getaffinity(0))
+    workers = env.workers or _cores()
     return make_emulators(make_emulator(env), num_envs, min(workers, num_envs))
+
+
+def _cores() -> int:
+    """How many cores are this process's: those that it may run on, and of these its share in OMP_NUM_THREADS.
+
+    That is where launchers (joblib, Ray, Slurm's scripts) say it, and where torch looks for its threads.
+    """
+    cores = len(os.sched_getaffinity(0))
+    share = os.environ.get("OMP_NUM_THREADS", "")
+    return min(cores, int(share)) if share.isdecimal() and int(share) else cores
 
 
 def choose_device(name: str) -> torch.device:

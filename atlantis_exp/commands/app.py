@@ -5,10 +5,12 @@ import itertools
 import os
 import re
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from importlib import import_module
 from pathlib import Path
-from typing import NoReturn, TypeVar
+from typing import NamedTuple, NoReturn, TypeVar
 
 import hydra
 from hydra import compose, initialize_config_dir
@@ -30,6 +32,8 @@ T = TypeVar("T")
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent
 CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _CHECKOUT / "conf"
+JOB_OF = "ATLANTIS_EXP_JOB_OF"
+"""The environment variable that tells a process that it does one job of a sweep, apart from its launcher's worker."""
 
 
 def _outputs_folder() -> str:
@@ -43,12 +47,29 @@ def _help(config_name: str) -> str:
     return f"python -m atlantis_exp {verb} KEY=VALUE ...\n{VERBS[verb]}\n\n== Verbs ==\n{verbs}\n"
 
 
+# Our presets of Hydra's launchers bear the plugins' own names, so that these check their keys, which Hydra deplores.
+warnings.filterwarnings("ignore", message=r"\n'hydra/launcher/\w+' is validated against ConfigStore schema")
 OmegaConf.register_new_resolver("outputs_folder", _outputs_folder, replace=True)
 OmegaConf.register_new_resolver("help", _help, replace=True)
 # The head that an objective needs, unless a person asks for another.
 OmegaConf.register_new_resolver(
     "head_for", lambda objective: "quantile" if objective == "quantile" else "plain", replace=True
 )
+
+
+class Launcher(NamedTuple):
+    """What runs the jobs of a sweep: an option of `hydra/launcher`, or Hydra's own, which runs them here in turn."""
+
+    name: str = "basic"
+    n_jobs: int | None = None  # at a time, as joblib counts them
+
+    @property
+    def is_basic(self) -> bool:
+        """Whether the jobs are done in the sweep's own process."""
+        return self.name == "basic"
+
+
+BASIC = Launcher()
 
 
 def run_verb(
@@ -60,16 +81,19 @@ def run_verb(
     """Compose `conf/<config_name>.yaml` with the command line's overrides, check it, and call `job` with the result.
 
     A user's mistake ends the process with exit code 2 and one line on stderr before Hydra or the job starts; a `Fault`
-    ends it with its own exit code and one line, and so does a folder that cannot be written. A sweep
-    runs inside of what `sweep` makes of all its jobs' configs.
+    ends it with its own exit code and one line, and so does a folder that cannot be written. A sweep, and any job that
+    is left to another process, runs inside of what `sweep` makes of all configs.
     """
     try:
         configs = check(config_name, schema, sys.argv[1:])
+        is_sweep = len(configs) > 1 or not launcher(config_name, sys.argv[1:]).is_basic
     except ConfigError as error:
         _quit(error)
 
     @hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)
     def main(composed: DictConfig) -> None:
+        if job_of() is not None:
+            sys.argv[1:] = HydraConfig.get().overrides.task  # what this job is, whoever started the process for what
         try:
             job(checked(schema, composed))
         except (ConfigError, Fault, OSError) as error:
@@ -80,7 +104,7 @@ def run_verb(
 
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     try:
-        with sweep(configs) if len(configs) > 1 else nullcontext():
+        with sweep(configs) if is_sweep else nullcontext():
             main()
     except (ConfigError, Fault, OSError) as error:
         _quit(error)
@@ -118,7 +142,7 @@ def check(config_name: str, schema: type[T], arguments: list[str]) -> list[T]:
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
             if hydras:
-                compose(config_name, hydras, return_hydra_config=True)
+                _check_launcher(compose(config_name, hydras, return_hydra_config=True))
             return [_check_job(config_name, schema, job, known) for job in _jobs(overrides)]
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(" ".join(re.split("Config search path|full_key:", str(error))[0].split())) from None
@@ -127,6 +151,38 @@ def check(config_name: str, schema: type[T], arguments: list[str]) -> list[T]:
 def swept(arguments: list[str]) -> list[str]:
     """The overrides of a command line that name several values. Raises: ConfigError."""
     return [text for text in _read_flags(arguments)[0] if _read_override(text).is_sweep_override()]
+
+
+def launcher(config_name: str, arguments: list[str]) -> Launcher:
+    """The launcher of a sweep that a command line asks for. Raises: ConfigError."""
+    texts, multirun = _read_flags(arguments)
+    hydras = [text for text in texts if _is_hydras(_read_override(text))]
+    if not multirun or not hydras:
+        return BASIC
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        settings = compose(config_name, hydras, return_hydra_config=True).hydra
+    return Launcher(settings.runtime.choices["hydra/launcher"], OmegaConf.select(settings, "launcher.n_jobs"))
+
+
+def job_of() -> str | None:
+    """The launcher that this process does one job of a sweep for; None where that is Hydra's own, or there is none.
+
+    It is `apart` for a job that a launcher's worker has left to a process of its own.
+    """
+    if JOB_OF in os.environ:
+        return os.environ[JOB_OF]
+    if not HydraConfig.initialized() or HydraConfig.get().mode is not RunMode.MULTIRUN:
+        return None
+    name = str(HydraConfig.get().runtime.choices["hydra/launcher"])
+    return None if Launcher(name).is_basic else name
+
+
+def _check_launcher(composed: DictConfig) -> None:
+    name, target = composed.hydra.runtime.choices["hydra/launcher"], composed.hydra.launcher._target_
+    try:
+        import_module(target.rpartition(".")[0])
+    except ImportError:
+        raise ConfigError(f"hydra/launcher={name}: needs pip install 'atlantis-exp[{name}]'") from None
 
 
 def _read_flags(arguments: list[str]) -> tuple[list[str], bool]:

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -94,7 +94,16 @@ class RunFolder:
             return "done"
         if self.status == "FAILED":
             return "failed"
-        return "running" if self.status == "RUNNING" and self._is_held() else "interrupted"
+        return "running" if self.status == "RUNNING" and self.is_held else "interrupted"
+
+    @property
+    def is_held(self) -> bool:
+        """Whether a process holds the run."""
+        path = self.path / "lock"
+        if not path.exists():
+            return False
+        with open(path, "a+") as file:
+            return not _locked(file)
 
     @property
     def _commit(self) -> Commit | None:
@@ -102,13 +111,6 @@ class RunFolder:
             return read_commit(self.path)
         except JournalError as error:
             raise Fault(str(error)) from None
-
-    def _is_held(self) -> bool:
-        path = self.path / "lock"
-        if not path.exists():
-            return False
-        with open(path, "a+") as file:
-            return not _locked(file)
 
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Keep the composed config."""
@@ -144,7 +146,7 @@ def settle(outputs: Path, continued: Path | None = None) -> None:
     for path in sorted(outputs.glob("*/*/commit.json")):
         folder = RunFolder(path.parent)
         try:
-            if folder.status == "RUNNING" and not folder._is_held():
+            if folder.status == "RUNNING" and not folder.is_held:
                 with suppress(Fault), folder.held():
                     Journal(folder.path).status("KILLED")
                     print(f"run {folder.name} was killed; the command that started it continues it")
@@ -200,11 +202,16 @@ def provenance() -> dict[str, str]:
 
 @contextmanager
 def published(
-    folder: RunFolder, tracking: TrackingConfig, outputs: Path, labels: Mapping[str, str]
+    folder: RunFolder,
+    tracking: TrackingConfig,
+    outputs: Path,
+    labels: Mapping[str, str],
+    others: Sequence[RunFolder] = (),
 ) -> Iterator[Journal]:
     """A journal in the run's folder that is mirrored to MLflow while it grows (tracking=mlflow).
 
     labels: tags that the run bears from its first moment; see `titles.labels`.
+    others: runs that other processes write and that are mirrored along.
 
     Raises:
         Fault: where the folder's journal is damaged.
@@ -216,7 +223,8 @@ def published(
     if tracking.name == "none":
         yield journal
         return
-    publisher = Publisher(folder.path, Store(outputs, tracking.experiment, tracking.uri))
+    store = Store(outputs, tracking.experiment, tracking.uri)
+    publisher = Publisher(folder.path, store, others=[other.path for other in others])
     try:
         yield journal
     finally:

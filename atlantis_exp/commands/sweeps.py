@@ -2,31 +2,40 @@
 
 import csv
 import io
+import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, get_args
 
 import numpy as np
 
-from atlantis_exp.commands.runs import RunFolder, State, provenance, published
+from atlantis_exp.commands.app import BASIC, Launcher
+from atlantis_exp.commands.live import LiveTable
+from atlantis_exp.commands.runs import RunFolder, State, provenance, published, settle
 from atlantis_exp.commands.titles import colour, group, title
 from atlantis_exp.config import Config, digest
 from atlantis_exp.faults import Fault
 from atlantis_exp.media import curves, strips
 from atlantis_exp.statistics import TABLE_COLUMNS
 from atlantis_exp.tracking.journal import Journal, JournalError, Metrics, Status, adopt, read, read_commit
+from atlantis_exp.tracking.store import TRACEBACK
 
 _PAGE_SECONDS = 60.0  # between two looks at the runs while they are trained
+_STOP_SECONDS = 300.0  # that jobs have to commit once their sweep ends
 
 
 @contextmanager
-def ledger(configs: Sequence[Config], swept: Sequence[str]) -> Iterator[None]:
+def ledger(configs: Sequence[Config], swept: Sequence[str], launcher: Launcher = BASIC) -> Iterator[None]:
     """Print a sweep's table of runs before and after it, and keep a page of it in MLflow (tracking=mlflow).
+
+    Where a launcher runs the jobs in other processes, these write their folders only: this one shows how they get on,
+    publishes them, and, but for Slurm's, has them commit before it ends itself.
 
     Whatever process trains them, the runs know their parent from their folders, where it stands before the first
     starts. The same set of runs is the same parent again. However the block ends, the page is closed with it.
@@ -40,10 +49,10 @@ def ledger(configs: Sequence[Config], swept: Sequence[str]) -> Iterator[None]:
     folders = [RunFolder(Path(config.paths.outputs) / "runs" / config.run_name()) for config in configs]
     _print_table(folders)
     try:
-        if configs[0].tracking.name == "none":
+        if launcher.is_basic and configs[0].tracking.name == "none":
             yield
         else:
-            with _page(configs, folders, swept):
+            with _page(configs, folders, swept, launcher):
                 yield
     finally:
         _print_table(folders)
@@ -52,50 +61,155 @@ def ledger(configs: Sequence[Config], swept: Sequence[str]) -> Iterator[None]:
 def _print_table(folders: Sequence[RunFolder]) -> None:
     states = [folder.state for folder in folders]
     for folder, state in zip(folders, states, strict=True):
-        print(f"  {state:12}{folder.name}")
+        print(f"  {state:12}{folder.name}{_reason(folder)}")
     counts = ", ".join(f"{states.count(state)} {state}" for state in get_args(State) if state in states)
     print(f"sweep of {len(folders)} runs: {counts}", flush=True)
 
 
+def _reason(folder: RunFolder) -> str:
+    """Why a run failed or was killed, and the file that tells more."""
+    if not folder.error:
+        return ""
+    path = folder.path / TRACEBACK
+    return f": {folder.error}" + (f" ({path})" if folder.state == "failed" and path.exists() else "")
+
+
 @contextmanager
-def _page(configs: Sequence[Config], folders: Sequence[RunFolder], swept: Sequence[str]) -> Iterator[None]:
+def _page(
+    configs: Sequence[Config], folders: Sequence[RunFolder], swept: Sequence[str], launcher: Launcher
+) -> Iterator[None]:
     outputs = Path(configs[0].paths.outputs)
     identity = digest({"runs": sorted(folder.name for folder in folders)})
     sweep = RunFolder(outputs / "sweeps" / f"sweep-{identity}")
     labels = {"mlflow.runName": f"sweep {' '.join(swept)}", "atlantis.kind": "training sweep"}
-    with sweep.held(), _terminable(), published(sweep, configs[0].tracking, outputs, labels) as journal:
-        if (commit := read_commit(sweep.path)) is not None and commit.offset:
-            journal.load_state_dict({"offset": commit.offset, "time": commit.updated})
-        journal.tags(provenance())
-        _describe(journal, configs, folders)
-        journal.status("RUNNING")
+    if not launcher.is_basic:
+        settle(outputs)  # which the jobs leave to this process
+    others = () if launcher.is_basic else folders
+    with sweep.held(), _terminable():
         for folder in folders:
             with suppress(Fault, JournalError), folder.held():  # what runs elsewhere stays where it is
                 adopt(folder.path, sweep.path)
-        closing = threading.Event()
-
-        def keep_describing() -> None:
-            while not closing.wait(_PAGE_SECONDS):
-                with suppress(OSError, Fault):  # the next look may fare better, and the last one tells
+        with published(sweep, configs[0].tracking, outputs, labels, others) as journal:
+            if (commit := read_commit(sweep.path)) is not None and commit.offset:
+                journal.load_state_dict({"offset": commit.offset, "time": commit.updated})
+            journal.tags(provenance())
+            _describe(journal, configs, folders)
+            journal.status("RUNNING")
+            error: BaseException | None = None
+            try:
+                with (
+                    _every(_PAGE_SECONDS, lambda: _describe(journal, configs, folders)) as close,
+                    nullcontext() if launcher.is_basic else _jobs(journal, configs, folders, launcher, close),
+                ):
+                    yield
+            except BaseException as raised:
+                error = raised
+                raise
+            finally:
+                status, reason = _ending(folders, error)
+                try:
+                    _draw(journal, configs, folders, commit is not None and commit.status == "FINISHED")
                     _describe(journal, configs, folders)
+                finally:
+                    journal.status(status, reason)
 
-        describing = threading.Thread(target=keep_describing, name="sweep page", daemon=True)
-        describing.start()
-        error: BaseException | None = None
+
+@contextmanager
+def _every(seconds: float, look: Callable[[], None]) -> Iterator[Callable[[], None]]:
+    """Calls `look` now and then in a thread, until the block or a call of what it yields ends."""
+    closing = threading.Event()
+
+    def run() -> None:
+        while not closing.wait(seconds):
+            with suppress(OSError, Fault):  # the next look may fare better
+                look()
+
+    def close() -> None:
+        closing.set()
+        thread.join()
+
+    thread = threading.Thread(target=run, name=f"every {seconds:g} s", daemon=True)
+    thread.start()
+    try:
+        yield close
+    finally:
+        close()
+
+
+@contextmanager
+def _jobs(
+    journal: Journal,
+    configs: Sequence[Config],
+    folders: Sequence[RunFolder],
+    launcher: Launcher,
+    close_page: Callable[[], None],
+) -> Iterator[None]:
+    """The jobs of a launcher: shown live, with a share of the cores each, and stopped before the sweep ends."""
+    if launcher.name not in ("joblib", "ray"):  # what a cluster was given, it does
+        with _shown(configs, folders):
+            yield
+        return
+    if launcher.name == "ray":
+        import ray  # noqa: F401 - which puts a handler of its own on SIGTERM
+
+    def stop() -> None:
+        close_page()  # it writes the journal, too
+        patience = time.monotonic() + _STOP_SECONDS
+        if any(folder.is_held for folder in own):
+            journal.status("KILLED")  # the jobs look at it
+            while any(folder.is_held for folder in own) and time.monotonic() < patience:
+                time.sleep(0.2)
+
+    def end(number: int, _: FrameType | None) -> NoReturn:
+        signal.signal(number, signal.SIG_DFL)  # a second one ends the process at once
+        print(f"atlantis_exp: {signal.Signals(number).name}: the jobs commit and end", file=sys.stderr, flush=True)
+        stop()
+        sys.exit(128 + number)
+
+    own = [folder for folder in folders if not folder.is_held]
+    handlers = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    with _shown(configs, folders), _shared_cores(launcher, folders):
+        if launcher.name == "joblib":
+            from joblib.externals.loky.backend.resource_tracker import ensure_running
+
+            ensure_running()  # started later, it would lift the mask
+        # A worker of joblib's that a signal ends would take all others along: they inherit this mask. The signals reach
+        # this process all the same, through its other threads.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, handlers if launcher.name == "joblib" else ())
         try:
             yield
-        except BaseException as raised:
-            error = raised
-            raise
         finally:
-            closing.set()
-            describing.join()
-            status, reason = _ending(folders, error)
-            try:
-                _draw(journal, configs, folders, commit is not None and commit.status == "FINISHED")
-                _describe(journal, configs, folders)
-            finally:
-                journal.status(status, reason)
+            stop()
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+
+
+@contextmanager
+def _shown(configs: Sequence[Config], folders: Sequence[RunFolder]) -> Iterator[None]:
+    table = LiveTable(configs, folders)
+    try:
+        with _every(table.seconds, table.look):
+            yield
+    finally:
+        table.close()
+
+
+@contextmanager
+def _shared_cores(launcher: Launcher, folders: Sequence[RunFolder]) -> Iterator[None]:
+    """Tells joblib's workers their share of the cores, unless a person has; Ray and Slurm do it themselves."""
+    if launcher.name != "joblib" or "OMP_NUM_THREADS" in os.environ:
+        yield
+        return
+    from joblib import cpu_count, effective_n_jobs
+
+    jobs = min(effective_n_jobs(launcher.n_jobs), sum(folder.state != "done" for folder in folders))
+    share = str(max(cpu_count() // max(jobs, 1), 1))
+    os.environ |= {"OMP_NUM_THREADS": share, "MKL_NUM_THREADS": share}
+    try:
+        yield
+    finally:
+        del os.environ["OMP_NUM_THREADS"], os.environ["MKL_NUM_THREADS"]
 
 
 @contextmanager
@@ -138,7 +252,8 @@ def _describe(journal: Journal, configs: Sequence[Config], folders: Sequence[Run
             row += [f"{result.steps:,}", *(scores or [""] * len(TABLE_COLUMNS)), f"{result.counts['hours']:.2f}"]
         lines.append(f"| {' | '.join(row + [''] * (len(head) - len(row)))} |")
         if folder.state == "failed":
-            failures.append(f"**{title(config)} failed**: {folder.error}")
+            told = f" (`{TRACEBACK}` of the run tells all)" if (folder.path / TRACEBACK).exists() else ""
+            failures.append(f"**{title(config)} failed**: {folder.error}{told}")
     groups = [
         f"| {name} | {len(means)} | {np.mean(means):,.0f} | {min(means):,.0f} | {max(means):,.0f} |"
         for name, (_, means) in _evaluations(configs, folders).items()

@@ -1,18 +1,21 @@
 """`python -m atlantis_exp [train] overrides`: one run; the same command again continues or reports it."""
 
+import dataclasses
 import os
 import shlex
 import signal
+import subprocess
 import sys
 import time
-from collections.abc import Sequence
+import traceback
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from math import inf
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from atlantis_exp.commands.app import run_verb, swept
+from atlantis_exp.commands.app import JOB_OF, job_of, launcher, run_verb, swept
 from atlantis_exp.config import Config, ConfigError, flatten, to_dict
 from atlantis_exp.faults import Fault
 
@@ -23,21 +26,32 @@ if TYPE_CHECKING:
     from atlantis_exp.training.progress import Progress
     from atlantis_exp.training.trainer import Trainer
 
+_LOOK_SECONDS = 1.0  # between two looks at whether the sweep goes on
+_OUTPUT = "output.txt"  # what a run in a process of its own printed
+
 
 class StopRequest:
     """Turns the first SIGINT, SIGTERM or SIGUSR2, or the end of the time, into a flag that the trainer looks at.
 
-    A second SIGINT ends the process at once; what was committed stays. Under Slurm SIGTERM is a warning: the run is
-    committed and goes on, since Slurm itself requeues or kills it.
+    So does the end of the sweep that the run is a job of, as `sweep_goes_on` tells it. A second SIGINT ends the process
+    at once; what was committed stays. Under Slurm SIGTERM is a warning: the run is committed and goes on, since Slurm
+    itself requeues or kills it.
     """
 
-    def __init__(self, seconds: float | None = None) -> None:
+    def __init__(self, seconds: float | None = None, sweep_goes_on: Callable[[], bool] = lambda: True) -> None:
         self.signal: int | None = None
         self._deadline = inf if seconds is None else time.monotonic() + seconds
+        self._sweep_goes_on = sweep_goes_on
+        self._sweep_has_ended = False
+        self._looked = 0.0  # time
         self._before: dict[int, Any] = {}  # handlers
 
     def __call__(self) -> bool:
-        return self.signal is not None or time.monotonic() >= self._deadline
+        now = time.monotonic()
+        if now - self._looked >= _LOOK_SECONDS:
+            self._looked = now
+            self._sweep_has_ended = self._sweep_has_ended or not self._sweep_goes_on()
+        return self.signal is not None or self._sweep_has_ended or now >= self._deadline
 
     def was_a_warning(self) -> bool:
         """Whether the run is to go on once it is committed; forgets the warning."""
@@ -48,6 +62,8 @@ class StopRequest:
 
     def leave(self, message: str) -> NoReturn:
         """End the process as the request wants it; raises Fault for the end of the time, so that a sweep goes on."""
+        if self.signal is None and self._sweep_has_ended:
+            raise Fault(f"the sweep has ended: {message}", exit_code=128 + signal.SIGTERM)
         if self.signal is None:
             raise Fault(f"budget.wall_clock: {message}", exit_code=124)  # as of timeout(1)
         print(f"atlantis_exp: {signal.Signals(self.signal).name}: {message}", file=sys.stderr, flush=True)
@@ -60,6 +76,7 @@ class StopRequest:
         """Listen while the block runs."""
         signals = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
         self._before = {number: signal.signal(number, self._receive) for number in signals}
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)  # as inherited from a launcher's worker
         try:
             yield
         finally:
@@ -74,13 +91,20 @@ class StopRequest:
 
 
 def train(config: Config) -> None:
-    """Start the run that this config is, continue it, or print its result if it has ended."""
+    """Start the run that this config is, continue it, or print its result if it has ended.
+
+    As a job of a sweep that another process runs, it writes the run's folder only: that process publishes it.
+    """
     from atlantis_exp.commands.runs import RunFolder, settle
     from atlantis_exp.tracking.journal import adopt
 
     outputs = Path(config.paths.outputs)
     folder = RunFolder(outputs / "runs" / config.run_name())
-    settle(outputs, folder.path if folder.result is None else None)
+    if job_of() is None:
+        settle(outputs, folder.path if folder.result is None else None)
+    sweep_goes_on = _watch_of(folder)
+    if not sweep_goes_on():
+        raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
     if config.resume == "must" and not folder.has_started:
         raise ConfigError(f"resume=must: there is no run {folder.name} under {outputs / 'runs'}")
     parent = folder.parent
@@ -93,26 +117,95 @@ def train(config: Config) -> None:
         if parent is not None:
             adopt(folder.path, parent)
         print(f"the run that was here is kept as {kept}")
-    if folder.has_started and (result := folder.result) is not None and not _goes_on(config, result):
+    if (result := _final_result(config, folder)) is not None:
         print(f"run {folder.name} has ended ({result.outcome} after {result.steps:,} steps):\n")
         print(result.report)
         return
     with folder.held():
-        _train(config, folder)
+        _train(config, folder, sweep_goes_on)
 
 
-def _goes_on(config: Config, result: "Result") -> bool:
-    """Whether a run that ended by its budget has now a larger one."""
+def train_job(config: Config) -> None:
+    """Train here, or, as a job of joblib's, in a process of its own: whatever ends it, the other jobs go on.
+
+    Raises:
+        Fault: where the run fails; as the one line that a launcher can carry from machine to machine.
+    """
+    if job_of() is None:
+        train(config)
+    elif job_of() == "joblib":
+        _train_apart(config)
+    else:
+        try:
+            train(config)
+        except (ConfigError, Fault, OSError):
+            raise
+        except Exception as error:
+            traceback.print_exc()
+            raise Fault(f"run {config.run_name()}: {type(error).__name__}: {error}") from error
+
+
+def _train_apart(config: Config) -> None:
+    from atlantis_exp.commands.runs import RunFolder
+    from atlantis_exp.tracking.journal import Journal, JournalError
+
+    folder = RunFolder(Path(config.paths.outputs) / "runs" / config.run_name())
+    if config.resume != "never" and _final_result(config, folder) is not None:
+        return
+    if not _watch_of(folder)():
+        raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
+    folder.path.mkdir(parents=True, exist_ok=True)
+    with open(folder.path / _OUTPUT, "a+") as output:
+        start = output.tell()
+        code = subprocess.run(
+            [sys.executable, "-m", "atlantis_exp", "train", *sys.argv[1:]],
+            env={**os.environ, JOB_OF: "apart"},
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+            check=False,
+        ).returncode
+        output.seek(start)
+        said = output.read().splitlines()
+    if code == 0:
+        return
+    reason = (
+        f"killed by {signal.Signals(-code).name}"
+        if code < 0
+        else (said or ["it said nothing"])[-1].removeprefix("atlantis_exp: ")
+    )
+    if code < 0 or (code == 1 and folder.state != "failed"):  # it could not say so itself
+        with suppress(Fault, JournalError), folder.held():
+            Journal(folder.path).status("KILLED" if code < 0 else "FAILED", reason)
+    raise Fault(f"run {folder.name}: {reason}; see {folder.path / _OUTPUT}", exit_code=code if code > 0 else 128 - code)
+
+
+def _final_result(config: Config, folder: "RunFolder") -> "Result | None":
+    """How the run has ended, None if it goes on: it has not, or it did by its budget and has now a larger one."""
+    if not folder.has_started or (result := folder.result) is None:
+        return None
     budget = config.budget.steps
-    return result.outcome == "budget" and (budget is None or budget > result.steps)
+    return None if result.outcome == "budget" and (budget is None or budget > result.steps) else result
 
 
-def _train(config: Config, folder: "RunFolder") -> None:
+def _watch_of(folder: "RunFolder") -> Callable[[], bool]:
+    """What tells whether the process that launched this job still wants it; Slurm's jobs do without that process."""
+    name, parent = job_of(), folder.parent
+    if parent is None or name not in ("joblib", "apart", "ray"):
+        return lambda: True
+    sweep = type(folder)(parent)
+    if name == "ray":  # whose machines may not see each other's locks
+        return lambda: sweep.status == "RUNNING"
+    return lambda: sweep.status == "RUNNING" and sweep.is_held
+
+
+def _train(config: Config, folder: "RunFolder", sweep_goes_on: Callable[[], bool]) -> None:
     from atlantis_exp.build import build_trainer, count_update_flops
     from atlantis_exp.commands.runs import Result, provenance, published
     from atlantis_exp.commands.titles import colour, group, labels, title
     from atlantis_exp.game.vector import WorkerDied
     from atlantis_exp.tracking.journal import JournalError
+    from atlantis_exp.tracking.store import TRACEBACK
     from atlantis_exp.training.checkpoint import CheckpointError
     from atlantis_exp.training.progress import Progress
     from atlantis_exp.training.trainer import Diverged
@@ -120,10 +213,11 @@ def _train(config: Config, folder: "RunFolder") -> None:
     progress = Progress()
     outputs = Path(config.paths.outputs)
     command = shlex.join(["python", "-m", "atlantis_exp", *sys.argv[1:]])
-    stop = StopRequest(config.budget.seconds)
+    stop = StopRequest(config.budget.seconds, sweep_goes_on)
+    tracking = config.tracking if job_of() is None else dataclasses.replace(config.tracking, name="none")
     shown = {**labels(title(config), colour(config)), "group": group(config), "atlantis.kind": "training"}
     about = f"Network `{config.model.name}` on {config.env.id}, seed {config.seed}. Continue or report: `{command}`"
-    with stop.installed(), published(folder, config.tracking, outputs, shown) as journal:
+    with stop.installed(), published(folder, tracking, outputs, shown) as journal:
         trainer: Trainer | None = None
         try:
             trainer = build_trainer(config, folder.path, journal, progress, about)
@@ -147,6 +241,7 @@ def _train(config: Config, folder: "RunFolder") -> None:
                 outcome = trainer.run(stop)
         except BaseException as error:
             with suppress(OSError):  # a full disk takes no status either; the next command sees that nobody holds it
+                (folder.path / TRACEBACK).write_text(traceback.format_exc())
                 journal.status("FAILED", str(error) or type(error).__name__)
             if isinstance(error, WorkerDied | CheckpointError | Diverged | OSError | JournalError):
                 raise Fault(f"run {folder.name}: {error}; continue with: {command}") from error
@@ -195,9 +290,9 @@ def sweep_ledger(configs: Sequence[Config]) -> AbstractContextManager[None]:
     """A sweep's table of runs, before and after it, and its page in MLflow."""
     from atlantis_exp.commands.sweeps import ledger
 
-    return ledger(configs, swept(sys.argv[1:]))
+    return ledger(configs, swept(sys.argv[1:]), launcher("config", sys.argv[1:]))
 
 
 def main() -> None:
     """Compose and train."""
-    run_verb("config", Config, train, sweep_ledger)
+    run_verb("config", Config, train_job, sweep_ledger)

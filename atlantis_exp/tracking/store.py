@@ -13,7 +13,7 @@ import shutil
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -46,6 +46,8 @@ _log = logging.getLogger(__name__)
 _POINTS = 500  # a call at least, where there are so many: fewer cost more each
 _PARAM_LENGTH = 6_000  # characters that MLflow keeps
 _RUN_NAME = "mlflow.runName"
+TRACEBACK = "traceback.txt"
+"""The file of a run folder that says at length why the run failed last."""
 
 
 @dataclass(frozen=True)
@@ -175,13 +177,13 @@ def unfinished(folder: Path, root: Path) -> Store | None:
 
 
 class Publisher:
-    """A thread that keeps MLflow up to date with a run folder's commits and never disturbs the run.
+    """A thread that keeps MLflow up to date with a run folder's commits, and with others', and never disturbs the runs.
 
-    It looks at the folder every `interval` seconds; while MLflow fails, less and less often, down to once a minute.
+    It looks at the folders every `interval` seconds; while MLflow fails, less and less often, down to once a minute.
     """
 
-    def __init__(self, folder: Path, store: Store, interval: float = 5.0) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, store: Store, interval: float = 5.0, others: Sequence[Path] = ()) -> None:
+        self._folders = (folder, *others)
         self._store = store
         self._interval = interval
         self._draining = threading.Event()
@@ -201,9 +203,13 @@ class Publisher:
         delay, failing = self._interval, False
         while True:
             draining = self._draining.is_set()  # asked first: what is committed before a drain is published by it
-            try:
-                publish(self._folder, self._store)
-            except Exception as error:
+            error: Exception | None = None
+            for folder in self._folders:
+                try:
+                    publish(folder, self._store)
+                except Exception as raised:  # one damaged folder is no reason to leave the others
+                    error = error or raised
+            if error is not None:
                 if not failing:
                     reason = f"{type(error).__name__}: {error}".partition("\n")[0]
                     _log.warning("Publishing to MLflow fails (%s); the run goes on and is published later", reason)
@@ -235,7 +241,7 @@ def publish(folder: Path, store: Store) -> None:
     folder = folder.resolve()
     with _locked(folder / "published.lock"):
         commit = read_commit(folder)
-        if commit is None:
+        if commit is None or commit.status == "SCHEDULED":
             return
         cursor = _Cursor.of(folder, store, commit)
         if (cursor.offset, cursor.standing) == (commit.offset, _standing(commit)):
@@ -315,6 +321,7 @@ class _Mirror:
 
     def __init__(self, folder: Path, store: Store, run_id: str) -> None:
         self._artifacts = folder / "artifacts"
+        self._traceback = folder / TRACEBACK
         self._client = store.client
         self._experiment_id = store.experiment_id
         self._run_id = run_id
@@ -350,6 +357,8 @@ class _Mirror:
             tags["mlflow.parentRunId"] = parent_run
         if commit.error:
             tags["error"] = commit.error
+            if self._traceback.exists():
+                self._client.log_artifact(self._run_id, str(self._traceback))
         elif "error" in self._client.get_run(self._run_id).data.tags:
             self._client.delete_tag(self._run_id, "error")
         self._send_tags(tags)
