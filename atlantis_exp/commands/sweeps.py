@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from multiprocessing import resource_tracker
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, get_args
@@ -170,9 +171,10 @@ def _jobs(
     handlers = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     with _shown(configs, folders), _shared_cores(launcher, folders):
         if launcher.name == "joblib":
-            from joblib.externals.loky.backend.resource_tracker import ensure_running
+            from joblib.externals.loky.backend import resource_tracker as its_own
 
-            ensure_running()  # started later, it would lift the mask
+            for tracker in (resource_tracker, its_own):
+                tracker.ensure_running()  # started later, it would lift the mask
         # A worker of joblib's that a signal ends would take all others along: they inherit this mask. The signals reach
         # this process all the same, through its other threads.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, handlers if launcher.name == "joblib" else ())
