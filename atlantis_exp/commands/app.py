@@ -51,6 +51,8 @@ def _help(config_name: str) -> str:
 warnings.filterwarnings("ignore", message=r"\n'hydra/launcher/\w+' is validated against ConfigStore schema")
 OmegaConf.register_new_resolver("outputs_folder", _outputs_folder, replace=True)
 OmegaConf.register_new_resolver("help", _help, replace=True)
+# Of a Ray cluster that is started here, bytes, the least that Ray takes; a running cluster (a string) has its own.
+OmegaConf.register_new_resolver("ray_object_store", lambda address: None if address else 78_643_200, replace=True)
 # The head that an objective needs, unless a person asks for another.
 OmegaConf.register_new_resolver(
     "head_for", lambda objective: "quantile" if objective == "quantile" else "plain", replace=True
@@ -62,6 +64,7 @@ class Launcher(NamedTuple):
 
     name: str = "basic"
     n_jobs: int | None = None  # at a time, as joblib counts them
+    address: str | None = None  # of a Ray cluster that runs already
 
     @property
     def is_basic(self) -> bool:
@@ -161,7 +164,8 @@ def launcher(config_name: str, arguments: list[str]) -> Launcher:
         return BASIC
     with initialize_config_dir(str(CONF), version_base="1.3"):
         settings = compose(config_name, hydras, return_hydra_config=True).hydra
-    return Launcher(settings.runtime.choices["hydra/launcher"], OmegaConf.select(settings, "launcher.n_jobs"))
+    n_jobs, address = (OmegaConf.select(settings, f"launcher.{key}") for key in ("n_jobs", "ray.init.address"))
+    return Launcher(settings.runtime.choices["hydra/launcher"], n_jobs, address)
 
 
 def job_of() -> str | None:

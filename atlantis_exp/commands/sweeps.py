@@ -150,8 +150,6 @@ def _jobs(
         with _shown(configs, folders):
             yield
         return
-    if launcher.name == "ray":
-        import ray  # noqa: F401 - which puts a handler of its own on SIGTERM
 
     def stop() -> None:
         close_page()  # it writes the journal, too
@@ -169,6 +167,9 @@ def _jobs(
 
     own = [folder for folder in folders if not folder.is_held]
     handlers = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    if launcher.name == "ray" and launcher.address is None and "RAY_ADDRESS" not in os.environ:
+        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # its own listens to 127.0.0.1 only
     with _shown(configs, folders), _shared_cores(launcher, folders):
         if launcher.name == "joblib":
             from joblib.externals.loky.backend import resource_tracker as its_own
@@ -180,6 +181,10 @@ def _jobs(
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, handlers if launcher.name == "joblib" else ())
         try:
             yield
+        except SystemExit as exiting:
+            if exiting.code == signal.SIGTERM:  # so Ray's own handler ends, which replaces ours
+                exiting.code = 128 + signal.SIGTERM
+            raise
         finally:
             stop()
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)

@@ -9,7 +9,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
 from math import inf
 from pathlib import Path
 from types import FrameType
@@ -137,12 +137,22 @@ def train_job(config: Config) -> None:
         _train_apart(config)
     else:
         try:
-            train(config)
+            with _kept_output(config) if job_of() == "ray" else nullcontext():
+                train(config)
         except (ConfigError, Fault, OSError):
             raise
         except Exception as error:
             traceback.print_exc()
             raise Fault(f"run {config.run_name()}: {type(error).__name__}: {error}") from error
+
+
+@contextmanager
+def _kept_output(config: Config) -> "Iterator[None]":
+    """What is printed goes to the run's folder, since Ray's own files of it are on whatever machine this is."""
+    folder = Path(config.paths.outputs) / "runs" / config.run_name()
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / _OUTPUT, "a", buffering=1) as output, redirect_stdout(output), redirect_stderr(output):
+        yield
 
 
 def _train_apart(config: Config) -> None:
@@ -165,6 +175,8 @@ def _train_apart(config: Config) -> None:
             stderr=output,
             check=False,
         ).returncode
+        if folder.parent and not RunFolder(folder.parent).is_held:
+            os._exit(code)  # the process that this worker works for was killed: there is nobody to tell
         output.seek(start)
         said = output.read().splitlines()
     if code == 0:
