@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple, NoReturn, TypeVar
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import hydra
 from hydra import compose, initialize_config_dir
@@ -64,7 +64,7 @@ class Launcher(NamedTuple):
 
     name: str = "basic"
     n_jobs: int | None = None  # at a time, as joblib counts them
-    address: str | None = None  # of a Ray cluster that runs already
+    ray: dict[str, Any] | None = None  # what `ray.init` takes
 
     @property
     def is_basic(self) -> bool:
@@ -164,8 +164,10 @@ def launcher(config_name: str, arguments: list[str]) -> Launcher:
         return BASIC
     with initialize_config_dir(str(CONF), version_base="1.3"):
         settings = compose(config_name, hydras, return_hydra_config=True).hydra
-    n_jobs, address = (OmegaConf.select(settings, f"launcher.{key}") for key in ("n_jobs", "ray.init.address"))
-    return Launcher(settings.runtime.choices["hydra/launcher"], n_jobs, address)
+    name, n_jobs = settings.runtime.choices["hydra/launcher"], OmegaConf.select(settings, "launcher.n_jobs")
+    if (ray := OmegaConf.select(settings, "launcher.ray.init")) is None:
+        return Launcher(name, n_jobs)
+    return Launcher(name, n_jobs, {str(key): ray[key] for key in ray})
 
 
 def job_of() -> str | None:

@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -145,7 +145,10 @@ def _jobs(
     launcher: Launcher,
     close_page: Callable[[], None],
 ) -> Iterator[None]:
-    """The jobs of a launcher: shown live, with a share of the cores each, and stopped before the sweep ends."""
+    """The jobs of a launcher: shown live, with a share of the cores each, and stopped before the sweep ends.
+
+    SIGINT and SIGTERM have them commit while this process waits; then it exits as a run would.
+    """
     if launcher.name not in ("joblib", "ray"):  # what a cluster was given, it does
         with _shown(configs, folders):
             yield
@@ -159,17 +162,20 @@ def _jobs(
             while any(folder.is_held for folder in own) and time.monotonic() < patience:
                 time.sleep(0.2)
 
+    exit_code: int | None = None
+
     def end(number: int, _: FrameType | None) -> NoReturn:
+        nonlocal exit_code
+        exit_code = 128 + number
         signal.signal(number, signal.SIG_DFL)  # a second one ends the process at once
         print(f"atlantis_exp: {signal.Signals(number).name}: the jobs commit and end", file=sys.stderr, flush=True)
         stop()
-        sys.exit(128 + number)
+        sys.exit(exit_code)
 
     own = [folder for folder in folders if not folder.is_held]
+    if launcher.ray is not None:
+        _start_ray(launcher.ray)
     handlers = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    if launcher.name == "ray" and launcher.address is None and "RAY_ADDRESS" not in os.environ:
-        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # its own listens to 127.0.0.1 only
     with _shown(configs, folders), _shared_cores(launcher, folders):
         if launcher.name == "joblib":
             from joblib.externals.loky.backend import resource_tracker as its_own
@@ -182,14 +188,24 @@ def _jobs(
         try:
             yield
         except SystemExit as exiting:
-            if exiting.code == signal.SIGTERM:  # so Ray's own handler ends, which replaces ours
-                exiting.code = 128 + signal.SIGTERM
+            if exit_code is not None:
+                exiting.code = exit_code  # which Ray replaces by 1
             raise
         finally:
             stop()
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
             for number, handler in handlers.items():
                 signal.signal(number, handler)
+
+
+def _start_ray(settings: Mapping[str, Any]) -> None:
+    """Start Ray, or join a cluster, before the launcher does: it puts a handler of its own on SIGTERM."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    if settings.get("address") is None and "RAY_ADDRESS" not in os.environ:
+        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # what is started listens to 127.0.0.1 only
+    import ray
+
+    ray.init(**settings)
 
 
 @contextmanager

@@ -167,7 +167,7 @@ def test_jobs_side_by_side_fail_and_are_killed_alone_and_the_same_command_runs_w
     sweep: Sweep, seeds: Callable[..., list[Config]], tiny: Compose, tmp_path: Path
 ) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the extra joblib is not installed")
-    words = (*FREQUENT, "phase.quick.steps=600")
+    words = (*FREQUENT, "phase.quick.steps=400")
     configs = seeds(*words)
     killed, failing, whole = (run_of(config) for config in configs)
     failing.path.mkdir(parents=True)
@@ -231,7 +231,7 @@ def test_on_a_ray_cluster_of_two_nodes_a_killed_workers_job_is_continued(
     cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
     try:
         cluster.add_node(**node)
-        words = (*FREQUENT, "phase.quick.steps=600")
+        words = (*FREQUENT, "phase.quick.steps=400")
         configs = seeds(*words)
         process = sweep(
             *words, "hydra/launcher=ray", f"hydra.launcher.ray.init.address={cluster.address}", "seed=0,1,2"
