@@ -49,7 +49,6 @@ def sweep(tiny_overrides: tuple[str, ...], tmp_path: Path) -> Iterator[Sweep]:
                 env=environment,
                 stdout=printed,
                 stderr=printed,
-                text=True,
                 start_new_session=True,
             )
         started.append(process)
