@@ -153,6 +153,9 @@ def test_the_table_follows_the_commits_of_runs(tiny: Compose, recorded: Callable
             table.look()
     recorded("seed=1")
     table.look()
+    drawn = io.StringIO()
+    LiveTable([config, other], [folder, run_of(other)], Console(file=drawn, width=120, force_terminal=True)).look()
+    assert "80 of 160 steps" in drawn.getvalue()
     lines = shown.getvalue().splitlines()
     assert [line.split()[0] for line in lines] == ["running", "running", "interrupted", "done"]
     assert "80 of 160 steps" in lines[1]

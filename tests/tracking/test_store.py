@@ -17,7 +17,7 @@ import pytest
 
 from atlantis_exp.tracking import store as store_module
 from atlantis_exp.tracking.journal import Journal, Metrics, adopt, read
-from atlantis_exp.tracking.store import Publisher, Store, publish, unfinished
+from atlantis_exp.tracking.store import TRACEBACK, Publisher, Store, publish, unfinished
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -351,6 +351,36 @@ def test_a_publisher_follows_the_run_until_it_is_drained(
     commit(journal)
     assert publisher.drain(30)
     assert points(root, tmp_path) == journaled_points(tmp_path)
+
+
+def test_a_publisher_takes_others_along_whatever_becomes_of_one_and_leaves_those_that_have_yet_to_start(
+    tmp_path: Path, root: Path, store: Store
+) -> None:
+    folders = [tmp_path / name for name in ("sweep", "damaged", "waiting", "whole")]
+    for folder in (folders[0], folders[1], folders[3]):
+        a_full_journal(folder)
+    whole = (folders[1] / "journal.jsonl").read_bytes()
+    (folders[1] / "journal.jsonl").write_bytes(whole[:-10])
+    adopt(folders[2], folders[0])
+    publisher = Publisher(folders[0], store, others=folders[1:])
+    assert not publisher.drain(5)
+    for folder in (folders[0], folders[3]):
+        assert points(root, folder) == journaled_points(folder)
+    assert not (folders[2] / "published.json").exists()
+    (folders[1] / "journal.jsonl").write_bytes(whole)
+    assert publisher.drain(30)
+    assert points(root, folders[1]) == journaled_points(folders[1])
+
+
+def test_a_traceback_beside_a_failure_is_shown_with_it(tmp_path: Path, root: Path, store: Store) -> None:
+    journal = a_full_journal(tmp_path)
+    (tmp_path / TRACEBACK).write_text("Traceback\nError")
+    publish(tmp_path, store)
+    assert not list((root / "artifacts").rglob(f"{run_id(tmp_path)}/artifacts/{TRACEBACK}"))
+    journal.status("FAILED", "Error")
+    publish(tmp_path, store)
+    (shown,) = (root / "artifacts").rglob(f"{run_id(tmp_path)}/artifacts/{TRACEBACK}")
+    assert shown.read_text() == "Traceback\nError"
 
 
 def test_two_publishers_of_one_folder_make_one_run(tmp_path: Path, root: Path, store: Store) -> None:
