@@ -21,7 +21,7 @@ from atlantis_exp.game.preprocessing import FrameStack, Preprocessing
 from atlantis_exp.game.vector import Emulators, make_emulators
 from atlantis_exp.learning.allocation import keep_freed_memory
 from atlantis_exp.learning.learner import Learner, splits
-from atlantis_exp.learning.objectives import DQN, DoubleDQN, Objective, Quantile
+from atlantis_exp.learning.objectives import DQN, DoubleDQN, DoubleQuantile, Objective, Quantile
 from atlantis_exp.learning.schedules import (
     Constant,
     Exponential,
@@ -54,7 +54,12 @@ NETWORKS: dict[type, type[nn.Module]] = {
     cfg.ResNetConfig: ResNetDQN,
     cfg.ResNetFastConfig: ResNetFast,
 }
-OBJECTIVES: dict[str, type[Objective]] = {"dqn": DQN, "double_dqn": DoubleDQN, "quantile": Quantile}
+OBJECTIVES: dict[str, type[Objective]] = {
+    "dqn": DQN,
+    "double_dqn": DoubleDQN,
+    "quantile": Quantile,
+    "double_quantile": DoubleQuantile,
+}
 SAMPLERS: dict[type, type[Sampler]] = {
     cfg.UniformConfig: UniformSampler,
     cfg.TopHalfConfig: TopHalfSampler,

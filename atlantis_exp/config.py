@@ -124,7 +124,7 @@ class DqnConfig(_BootstrapConfig):
 class QuantileConfig(_BootstrapConfig):
     """The bootstrap target of a distribution's quantiles, and its loss."""
 
-    name: Literal["quantile"]
+    name: Literal["quantile", "double_quantile"]
     quantiles: Count
 
 
@@ -372,10 +372,10 @@ class Config:
                 f"env.size={self.env.size}: model '{self.model.name}' needs at least {self.model.smallest} pixels; "
                 f"it is made for {self.model.input_size}"
             )
-        if (self.objective.name == "quantile") != (self.model.head == "quantile"):
+        if isinstance(self.objective, QuantileConfig) != (self.model.head == "quantile"):
             raise ConfigError(
                 f"model.head={self.model.head}: does not go with objective.name={self.objective.name}; "
-                "objective=quantile and model.head=quantile need each other"
+                "model.head=quantile and objective=quantile or double_quantile need each other"
             )
         if self.training.batch_size > self.replay.capacity:
             raise ConfigError(
