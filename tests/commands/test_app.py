@@ -20,6 +20,7 @@ from atlantis_exp.config import (
     Config,
     ConfigError,
     EvaluateConfig,
+    ExportConfig,
     PlayConfig,
     QueryConfig,
     ReportConfig,
@@ -32,6 +33,7 @@ from atlantis_exp.config import (
 SCHEMAS: dict[str, type[Any]] = {
     "config": Config,
     "evaluate": EvaluateConfig,
+    "export": ExportConfig,
     "baseline": BaselineConfig,
     "compare": CompareConfig,
     "play": PlayConfig,
@@ -181,6 +183,9 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("evaluate evaluation.epsilon=2", "evaluation.epsilon=2", "less than or equal to 1"),
     ("evaluate epsilom=0.1", "epsilom=0.1", "no such key"),
     ("evaluate weights=first", "weights=first", "best, latest"),
+    ("evaluate weights=bst", "weights=bst", "'best'"),
+    ("export weights=pretrained/fast", "weights=pretrained/fast", "best, latest"),
+    ("export too=pretrained/fast", "too=pretrained/fast", "'to'"),
     ("report paths.output=x", "paths.output", "'paths.outputs'"),
     ("ui port=80", "port=80", "greater than or equal to 1024"),
 ]

@@ -83,8 +83,8 @@ def test_the_quantile_loss_is_sb3_contrib_s_sum_over_quantiles(quantiles: int) -
 
 @pytest.mark.parametrize("n_step", [2, 3, 5])
 def test_returns_over_n_steps_are_torchrl_s(n_step: int) -> None:
-    """Rewards, the state after them and its distance. `MultiStep` leaves `terminated` as it was a step after s_t, so that
-    where the bootstrap is cut follows here from the state reached."""
+    """Rewards, the state after them and its distance. `MultiStep` leaves `terminated` as it was a step after s_t: where
+    the bootstrap is cut follows here from the state reached."""
     postprocs = pytest.importorskip("torchrl.data.postprocs", reason="torchrl: extra `peers`")
     from tensordict import TensorDict
 
