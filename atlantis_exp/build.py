@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import safetensors.torch
 import torch
+from safetensors import SafetensorError
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -21,7 +22,7 @@ from atlantis_exp.game.preprocessing import FrameStack, Preprocessing
 from atlantis_exp.game.vector import Emulators, make_emulators
 from atlantis_exp.learning.allocation import keep_freed_memory
 from atlantis_exp.learning.learner import Learner, splits
-from atlantis_exp.learning.objectives import DQN, DoubleDQN, Objective, Quantile
+from atlantis_exp.learning.objectives import DQN, DoubleDQN, DoubleQuantile, Objective, Quantile
 from atlantis_exp.learning.schedules import (
     Constant,
     Exponential,
@@ -40,7 +41,7 @@ from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.replay.samplers import PrioritizedSampler, Sampler, TopHalfSampler, UniformSampler
 from atlantis_exp.tracking.journal import Tracker
 from atlantis_exp.training.actor import Actor, ConstantActor, EpsilonGreedy, PersonActor, RandomActor
-from atlantis_exp.training.checkpoint import Checkpoints
+from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints
 from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate, replay
 from atlantis_exp.training.forecast import Forecast, forecast
 from atlantis_exp.training.progress import Progress
@@ -54,7 +55,12 @@ NETWORKS: dict[type, type[nn.Module]] = {
     cfg.ResNetConfig: ResNetDQN,
     cfg.ResNetFastConfig: ResNetFast,
 }
-OBJECTIVES: dict[str, type[Objective]] = {"dqn": DQN, "double_dqn": DoubleDQN, "quantile": Quantile}
+OBJECTIVES: dict[str, type[Objective]] = {
+    "dqn": DQN,
+    "double_dqn": DoubleDQN,
+    "quantile": Quantile,
+    "double_quantile": DoubleQuantile,
+}
 SAMPLERS: dict[type, type[Sampler]] = {
     cfg.UniformConfig: UniformSampler,
     cfg.TopHalfConfig: TopHalfSampler,
@@ -274,25 +280,38 @@ def film_episode(episode: Episode, actor: Actor, env: cfg.EnvConfig) -> bytes:
     return film(pictures(), 60 * episode.steps / episode.frames)
 
 
-def build_network_actor(config: cfg.Config, folder: Path, weights: str, device: str) -> tuple[Actor, int]:
-    """The player that a stored run has trained, from its last commit or its best evaluation, and that step.
+def stored_weights(config: cfg.Config, folder: Path, weights: str) -> tuple[bytes, int]:
+    """A stored run's network as safetensors, from its last commit or its best evaluation, and that step.
 
     Raises:
         Fault: where the run has no such weights.
     """
-    state = Checkpoints(folder / "checkpoints", config.identity()).load()
+    try:
+        state = Checkpoints(folder / "checkpoints", config.identity()).load()
+    except CheckpointError as error:
+        raise Fault(f"run {folder.name}: {error}") from error
     if state is None:
         raise Fault(f"run {folder.name} has no checkpoint yet")
-    step = int(state["counters"]["steps"])
-    if weights == "best":
-        path = folder / "artifacts" / "best.safetensors"
-        if not path.exists():
-            raise Fault(f"run {folder.name} has no evaluation yet, so no best weights; weights=latest has some")
-        state["learner"]["network"] = safetensors.torch.load_file(path)
-        step = int(state["best_step"])
-    learner = build_learner(dataclasses.replace(config, device=device))
-    learner.load_state_dict(state["learner"])
-    return EpsilonGreedy(learner.q_values, len(ACTIONS), watches=True), step
+    if weights == "latest":
+        return safetensors.torch.save(state["learner"]["network"]), int(state["counters"]["steps"])
+    path = folder / "artifacts" / "best.safetensors"
+    if not path.exists():
+        raise Fault(f"run {folder.name} has no evaluation yet, so no best weights; weights=latest has some")
+    return path.read_bytes(), int(state["best_step"])
+
+
+def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Actor:
+    """The player that a training of this config has made, from its network as safetensors.
+
+    Raises:
+        Fault: where the weights are damaged or another network's.
+    """
+    try:
+        learner = build_learner(dataclasses.replace(config, device=device))
+        learner.load_state_dict({**learner.state_dict(), "network": safetensors.torch.load(weights)})
+    except (SafetensorError, RuntimeError) as error:
+        raise Fault(f"the weights are damaged or another network's: {' '.join(str(error).split())}") from error
+    return EpsilonGreedy(learner.q_values, len(ACTIONS), watches=True)
 
 
 def build_forecast(config: cfg.Config, steps_done: int) -> Forecast:

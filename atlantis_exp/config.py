@@ -124,7 +124,7 @@ class DqnConfig(_BootstrapConfig):
 class QuantileConfig(_BootstrapConfig):
     """The bootstrap target of a distribution's quantiles, and its loss."""
 
-    name: Literal["quantile"]
+    name: Literal["quantile", "double_quantile"]
     quantiles: Count
 
 
@@ -372,10 +372,10 @@ class Config:
                 f"env.size={self.env.size}: model '{self.model.name}' needs at least {self.model.smallest} pixels; "
                 f"it is made for {self.model.input_size}"
             )
-        if (self.objective.name == "quantile") != (self.model.head == "quantile"):
+        if isinstance(self.objective, QuantileConfig) != (self.model.head == "quantile"):
             raise ConfigError(
                 f"model.head={self.model.head}: does not go with objective.name={self.objective.name}; "
-                "objective=quantile and model.head=quantile need each other"
+                "model.head=quantile and objective=quantile or double_quantile need each other"
             )
         if self.training.batch_size > self.replay.capacity:
             raise ConfigError(
@@ -428,14 +428,50 @@ class Config:
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
 class EvaluateConfig:
-    """Evaluation of a stored run."""
+    """Evaluation of a stored run, or of exported weights."""
 
     run: str
-    weights: Literal["latest", "best"]
+    weights: str  # latest, best or a folder
     device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
     evaluation: EvaluationConfig
     tracking: TrackingConfig
     paths: PathsConfig
+
+    def __post_init__(self) -> None:
+        if self.weights not in ("latest", "best") and "/" not in self.weights:
+            raise ConfigError(
+                f"weights={self.weights}: neither a run's nor a folder, as in pretrained/NAME; "
+                f"{nearest(self.weights, ('latest', 'best'))}"
+            )
+
+
+@dataclass(config=_STRICT, kw_only=True, frozen=True)
+class ExportConfig:
+    """A stored run's network as a folder to hand on."""
+
+    run: str
+    weights: Literal["latest", "best"]
+    to: Annotated[str, Field(min_length=1)] | None
+    device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
+    evaluation: EvaluationConfig
+    paths: PathsConfig
+
+
+@dataclass(config=_STRICT, kw_only=True, frozen=True)
+class CardConfig:
+    """What stands beside exported weights: which training they are of, and what they score."""
+
+    format: Literal[1]
+    run: str
+    weights: Literal["latest", "best"]
+    step: Annotated[int, Field(ge=0)]  # of the training
+    reached: dict[str, float]  # episodes, frames, updates and hours, at the last point of the curve until then
+    made: dict[str, str]  # command, commit and versions of the training's last session
+    precision: Literal["float32", "float16"]
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]  # of weights.safetensors
+    config: Config
+    evaluation: EvaluationConfig  # that gave the scores
+    scores: Annotated[list[float], Field(min_length=1)]  # an episode
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)

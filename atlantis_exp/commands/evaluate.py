@@ -1,47 +1,72 @@
-"""`python -m atlantis_exp evaluate run=NAME epsilon=0.05`: a stored run's network, played again."""
+"""`python -m atlantis_exp evaluate run=NAME epsilon=0.05`: a stored run's network, or an exported one, played again."""
 
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from safetensors import SafetensorError
+from hydra.core.hydra_config import HydraConfig
+from rich.console import Console
 
 from atlantis_exp.commands.app import run_verb
-from atlantis_exp.config import Config, ConfigError, EvaluateConfig, digest, parse, to_dict
-from atlantis_exp.faults import Fault
+from atlantis_exp.config import ConfigError, EvaluateConfig, digest, to_dict
 
 
 def evaluate(config: EvaluateConfig) -> None:
-    """Play a stored network on its own environment, print the report's table, and record it beside the run."""
-    from atlantis_exp.build import build_network_actor, run_evaluation
-    from atlantis_exp.commands.runs import RunFolder, find_run, record_evaluation, settle
+    """Play a network on its own environment, print the report's table, and record it beside the runs.
+
+    An exported network plays by the protocol of its card, as far as the command line does not ask for another.
+    """
+    from atlantis_exp.build import build_network_actor, run_evaluation, stored_weights
+    from atlantis_exp.commands.cards import beside, build_exported_actor, read_card
+    from atlantis_exp.commands.runs import RunFolder, find_run, record_evaluation, settle, trained_config
     from atlantis_exp.commands.titles import colour, labels, title
-    from atlantis_exp.training.checkpoint import CheckpointError
     from atlantis_exp.training.progress import Progress
 
-    outputs = Path(config.paths.outputs)
+    outputs, settings, card = Path(config.paths.outputs), config.evaluation, None
     settle(outputs)
-    run = find_run(outputs, config.run)
-    try:
-        trained = parse(Config, run.config)
-    except ConfigError as error:
-        raise ConfigError(f"{run.path / 'config.json'}: {error}") from None
+    if config.weights in ("latest", "best"):
+        run = find_run(outputs, config.run)
+        name, trained, source = run.name, trained_config(run), {"run": run.name}
+        weights, step = stored_weights(trained, run.path, config.weights)
+        actor = build_network_actor(trained, weights, config.device)
+    else:
+        asked = {override.split("=")[0].lstrip("+") for override in HydraConfig.get().overrides.task}
+        if "run" in asked:
+            raise ConfigError(
+                f"run={config.run}: weights={config.weights} are of no run here; leave out one of the two"
+            )
+        folder = Path(config.weights)
+        card, weights = read_card(folder)
+        name, trained, step = folder.resolve().name, card.config, card.step
+        source = {"weights": name, "sha256": card.sha256}
+        protocol: dict[str, Any] = {
+            key: getattr(card.evaluation, key)
+            for key in ("episodes", "epsilon", "seed")
+            if not asked & {"evaluation", f"evaluation.{key}"}
+        }
+        settings = replace(settings, **protocol)
+        actor = build_exported_actor(trained, weights, config.device)
     progress = Progress()
-    try:
-        actor, step = build_network_actor(trained, run.path, config.weights, config.device)
-    except (CheckpointError, SafetensorError) as error:
-        raise Fault(f"run {run.name}: the {config.weights} weights cannot be read: {error}") from error
-    settings = config.evaluation
-    progress.say(f"{run.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
+    progress.say(f"{name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
     evaluation, video = run_evaluation(actor, trained.env, settings, settings.episodes, progress)
-    facts = {"run": run.name, "step": step, "evaluation": to_dict(settings), "env": to_dict(trained.env)}
-    folder = RunFolder(outputs / "evaluations" / f"{run.name}-at-{step}-{digest(facts)[:6]}")
+    facts = {**source, "step": step, "evaluation": to_dict(settings), "env": to_dict(trained.env)}
+    recorded = RunFolder(outputs / "evaluations" / f"{name}-at-{step}-{digest(facts)[:6]}")
     shown = labels(f"evaluation of {title(trained)} at {step} {digest(facts)[:6]}", colour(trained))
-    record_evaluation(folder, "evaluation", facts, evaluation, video, config.tracking, outputs, shown)
+    record_evaluation(recorded, "evaluation", facts, evaluation, video, config.tracking, outputs, shown)
+    if card:
+        table = beside(card, settings, [episode.score for episode in evaluation.episodes])
+        Console(highlight=False, width=max(Console().width, 130)).print(table)
+
+
+def spell_out() -> None:
+    """Let `epsilon=` and `episodes=` on the command line be the evaluation's."""
+    # Hydra itself would take `epsilon` for the config group of that name.
+    sys.argv[1:] = [re.sub(r"^(epsilon|episodes)=", r"evaluation.\1=", argument) for argument in sys.argv[1:]]
 
 
 def main() -> None:
-    """Compose and evaluate; `epsilon=` and `episodes=` are short for the evaluation's."""
-    # Hydra itself would take `epsilon` for the config group of that name.
-    sys.argv[1:] = [re.sub(r"^(epsilon|episodes)=", r"evaluation.\1=", argument) for argument in sys.argv[1:]]
+    """Compose and evaluate."""
+    spell_out()
     run_verb("evaluate", EvaluateConfig, evaluate)

@@ -15,7 +15,7 @@ from typing import Any, Literal, TextIO, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from atlantis_exp.config import ConfigError, TrackingConfig, flatten, nearest
+from atlantis_exp.config import Config, ConfigError, TrackingConfig, flatten, nearest, parse
 from atlantis_exp.faults import Fault
 from atlantis_exp.media import score_histogram
 from atlantis_exp.tracking.journal import Commit, Journal, JournalError, Status, read_commit, write_file
@@ -176,6 +176,14 @@ def find_run(outputs: Path, name: str) -> RunFolder:
     if matching:
         raise ConfigError(f"run={name}: could be any of {', '.join(folder.name for folder in matching)}")
     raise ConfigError(f"run={name}: no such run; {nearest(name, {folder.name for folder in folders})}")
+
+
+def trained_config(run: RunFolder) -> Config:
+    """The config of a training run. Raises: ConfigError, naming its file."""
+    try:
+        return parse(Config, run.config)
+    except ConfigError as error:
+        raise ConfigError(f"{run.path / 'config.json'}: {error}") from None
 
 
 def all_runs(outputs: Path) -> list[RunFolder]:

@@ -147,10 +147,12 @@ class ProcessEmulators(Emulators):
         self._envs = [range(worker, num_envs, workers) for worker in range(workers)]
         self._connections: list[Connection[Any, Any]] = []
         self._processes: list[multiprocessing.context.SpawnProcess] = []
+        cores = _cores_for(workers)
         atexit.register(self.close)  # multiprocessing's own exit waits for workers that are deaf to its SIGTERM
         for worker, envs in enumerate(self._envs):
             connection, theirs = context.Pipe()
-            process = context.Process(target=_work, args=(worker, theirs, make, envs, memory, row), daemon=True)
+            core = cores[worker % len(cores)] if cores else None
+            process = context.Process(target=_work, args=(core, theirs, make, envs, memory, row), daemon=True)
             process.start()
             theirs.close()  # the worker now holds the only other end, so its death ends the pipe
             self._connections.append(connection)
@@ -211,15 +213,19 @@ def _play(emulators: dict[int, Emulator], rows: Rows, method: str, calls: Calls)
     return returned
 
 
-def _stay(worker: int) -> None:
-    """Keeps this process on one core: woken together, workers else begin on the core of whoever wakes them."""
-    if hasattr(os, "sched_setaffinity"):  # Linux
-        cores = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {cores[worker % len(cores)]})
+def _cores_for(workers: int) -> list[int]:
+    """The cores that workers keep to: woken together, they else begin on the core of whoever wakes them.
+
+    None where there are fewer workers than cores: runs side by side would keep to the same few.
+    """
+    if not hasattr(os, "sched_getaffinity"):  # no Linux
+        return []
+    cores = sorted(os.sched_getaffinity(0))
+    return cores if workers >= len(cores) else []
 
 
 def _work(
-    worker: int,
+    core: int | None,
     connection: "Connection[Any, Any]",
     make: Callable[[], Emulator],
     envs: Iterable[int],
@@ -230,7 +236,8 @@ def _work(
     for number in _FOR_THE_PARENT:
         signal.signal(number, signal.SIG_IGN)
     cv2.setNumThreads(1)
-    _stay(worker)
+    if core is not None:
+        os.sched_setaffinity(0, {core})
     try:
         emulators = {env: make() for env in envs}
         rows = np.frombuffer(memoryview(memory), row)

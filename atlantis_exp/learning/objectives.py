@@ -86,6 +86,11 @@ class Quantile(DQN):
         return (weight_BNN * smooth_l1_loss(z_BNN, target_BNN, reduction="none")).mean(2).sum(1)
 
 
+@dataclass(frozen=True)
+class DoubleQuantile(Quantile, DoubleDQN):
+    """QR-DQN whose online network chooses the next action, as in Double DQN; the target network gives its quantiles."""
+
+
 def td_errors(q: torch.Tensor, a_t: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Return how far each sample's value, or its quantiles' mean, is off its target, (B,)."""
     error = target - taken(q, a_t)

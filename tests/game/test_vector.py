@@ -262,10 +262,14 @@ def test_workers_import_nothing_but_this_wing() -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs Linux")
-def test_workers_stay_on_a_core_each() -> None:
-    with make_emulators(make, 3, workers=3) as emulators:
-        assert isinstance(emulators, ProcessEmulators)
-        emulators.reset(range(3))
-        cores = [os.sched_getaffinity(process.pid or 0) for process in emulators._processes]
+@pytest.mark.parametrize("spare", [0, 1])
+def test_workers_stay_on_a_core_each_unless_cores_are_left_over(spare: int) -> None:
     mine = sorted(os.sched_getaffinity(0))
-    assert cores == [{mine[worker % len(mine)]} for worker in range(3)]
+    workers = len(mine) - spare
+    if workers < 1:
+        pytest.skip("needs two cores")
+    with make_emulators(make, workers + 1, workers) as emulators:
+        assert isinstance(emulators, ProcessEmulators)
+        emulators.reset(range(workers + 1))
+        cores = [os.sched_getaffinity(process.pid or 0) for process in emulators._processes]
+    assert cores == ([set(mine)] * workers if spare else [{core} for core in mine])

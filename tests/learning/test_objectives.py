@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from atlantis_exp.learning.objectives import DQN, DoubleDQN, Quantile, action_values, td_errors
+from atlantis_exp.learning.objectives import DQN, DoubleDQN, DoubleQuantile, Quantile, action_values, td_errors
 
 every_seed = given(seed=st.integers(0, 1000))
 
@@ -52,8 +52,25 @@ def test_the_quantile_targets_are_the_target_network_s_of_its_action_with_the_be
             assert targets[b, j].item() == pytest.approx(expected, rel=1e-5, abs=1e-5)
 
 
+@every_seed
+def test_double_quantile_targets_are_the_target_network_s_of_the_online_network_s_best_mean(seed: int) -> None:
+    rewards, discounts, online, target, now = _batch(seed, 5)
+    targets = DoubleQuantile().targets(rewards, torch.arange(9), discounts, lambda s: online[s], lambda s: target[s])
+    for b in range(9):
+        best = max(range(4), key=lambda action: sum(online[b, action].tolist()))
+        for j in range(5):
+            expected = float(rewards[b]) + float(discounts[b]) * float(target[b, best, j])
+            assert targets[b, j].item() == pytest.approx(expected, rel=1e-5, abs=1e-5)
+    actions = torch.arange(9) % 4
+    torch.testing.assert_close(
+        DoubleQuantile().losses(now, actions, targets), Quantile().losses(now, actions, targets), rtol=0, atol=0
+    )
+
+
 @pytest.mark.parametrize(
-    ("objective", "shape"), [(DQN(), (2, 4)), (DoubleDQN(), (2, 4)), (Quantile(), (2, 4, 3))], ids=str
+    ("objective", "shape"),
+    [(DQN(), (2, 4)), (DoubleDQN(), (2, 4)), (Quantile(), (2, 4, 3)), (DoubleQuantile(), (2, 4, 3))],
+    ids=str,
 )
 def test_nothing_comes_through_a_cut_bootstrap(objective: DQN | Quantile, shape: tuple[int, ...]) -> None:
     wild = torch.full(shape, torch.inf)

@@ -1,0 +1,25 @@
+"""The weights that come with the repository: each folder is what its card says."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from atlantis_exp.commands.cards import MOST_BYTES, build_exported_actor, read_card
+from atlantis_exp.training.actor import EpsilonGreedy
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+FOLDERS = sorted(path.parent for path in REPOSITORY.glob("pretrained/*/card.json"))
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_a_folder_is_what_its_card_says(folder: Path) -> None:
+    card, weights = read_card(folder)  # which checks the schema and the checksum
+    assert len(weights) <= MOST_BYTES
+    assert card.sha256 in (folder / "README.md").read_text()
+    actor = build_exported_actor(card.config, weights, "cpu")
+    assert isinstance(actor, EpsilonGreedy)
+    env = card.config.env
+    values = actor.q_values(np.zeros((2, env.stack, env.size, env.size), np.uint8))
+    assert values.shape == (2, 4)
+    assert np.isfinite(values).all()
