@@ -227,7 +227,7 @@ class Publisher:
 
 
 def publish(folder: Path, store: Store) -> None:
-    """Brings the MLflow run of a folder up to the folder's last commit.
+    """Brings the MLflow run of a folder up to the folder's last commit, unless the run has yet to start.
 
     May be repeated, interrupted, and run by several processes at once without doubling anything. How far it came stands
     in `published.json`; without that file everything is sent again. Lines are sent in their order, so a step never runs
