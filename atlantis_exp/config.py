@@ -427,6 +427,30 @@ class Config:
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
+class PruningConfig:
+    """When a trial is cut short: below the median of the others' at the same evaluation."""
+
+    trials: Count | None  # that have ended before any is cut short; null: none ever is
+    evaluations: Annotated[int, Field(ge=0)]  # of its own that a trial is spared
+
+
+@dataclass(config=_STRICT, kw_only=True, frozen=True)
+class SearchConfig(Config):
+    """A search for the best values of some keys of a training's config, which is the rest of this one."""
+
+    trials: Count
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,59}$")] | None
+    startup: Annotated[int, Field(ge=0)]  # trials drawn at random
+    pruning: PruningConfig
+    space: dict[str, str]  # what is searched of a key, in Hydra's words: `tag(log, interval(1e-5, 1e-3))`
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.evaluation.at_end:
+            raise ConfigError("evaluation.at_end=false: a search compares its trials by the evaluation at their end")
+
+
+@dataclass(config=_STRICT, kw_only=True, frozen=True)
 class EvaluateConfig:
     """Evaluation of a stored run, or of exported weights."""
 

@@ -5,6 +5,7 @@ Hydra and OmegaConf live here and nowhere else; what a verb does lives on the fl
 
 VERBS = {
     "train": "one run, from a composed config; the same command again continues or reports it (the default verb)",
+    "search": "the best values of any keys, by Optuna: trials=20 optimizer=adam,rmsprop",
     "evaluate": "a stored run's network, played again: run=NAME epsilon=0.05; an exported one: weights=FOLDER",
     "export": "a stored run's network as a folder to hand on: weights, card and scores: run=NAME to=pretrained/NAME",
     "baseline": "a player without a network as a tracked run: agent=random, agent=constant",

@@ -7,7 +7,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, TypeVar
@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, NoReturn, TypeVar
 import hydra
 from hydra import compose, initialize_config_dir
 from hydra._internal.utils import get_args_parser
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -91,7 +92,7 @@ def run_verb(
         configs = check(config_name, schema, sys.argv[1:])
         is_sweep = len(configs) > 1 or not launcher(config_name, sys.argv[1:]).is_basic
     except ConfigError as error:
-        _quit(error)
+        leave(error)
 
     @hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)
     def main(composed: DictConfig) -> None:
@@ -103,17 +104,18 @@ def run_verb(
             # In a sweep an exit would take the other jobs along, an exception does not.
             if HydraConfig.get().mode is RunMode.MULTIRUN:
                 raise
-            _quit(error)
+            leave(error)
 
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     try:
         with sweep(configs) if is_sweep else nullcontext():
             main()
     except (ConfigError, Fault, OSError) as error:
-        _quit(error)
+        leave(error)
 
 
-def _quit(error: Exception) -> NoReturn:
+def leave(error: Exception) -> NoReturn:
+    """End the process with one line and the error's exit code: 2 for a user's mistake."""
     print(f"atlantis_exp: {error}", file=sys.stderr)
     sys.exit(2 if isinstance(error, ConfigError) else getattr(error, "exit_code", 1))
 
@@ -135,7 +137,7 @@ def check(config_name: str, schema: type[T], arguments: list[str]) -> list[T]:
         ConfigError: one line for the first mistake, with the nearest valid choice or the valid range.
     """
     texts, multirun = _read_flags(arguments)
-    overrides = [_read_override(text) for text in texts]
+    overrides = [read_override(text) for text in texts]
     for override in overrides:
         if override.is_sweep_override() and not multirun:
             raise ConfigError(f"{override.input_line}: several values are a sweep; add -m")
@@ -143,7 +145,7 @@ def check(config_name: str, schema: type[T], arguments: list[str]) -> list[T]:
     overrides = [override for override in overrides if not _is_hydras(override)]
     known: dict[tuple[str, ...], set[str]] = {}
     try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
+        with composing():
             if hydras:
                 _check_launcher(compose(config_name, hydras, return_hydra_config=True))
             return [_check_job(config_name, schema, job, known) for job in _jobs(overrides)]
@@ -151,18 +153,30 @@ def check(config_name: str, schema: type[T], arguments: list[str]) -> list[T]:
         raise ConfigError(" ".join(re.split("Config search path|full_key:", str(error))[0].split())) from None
 
 
+@contextmanager
+def composing() -> Iterator[None]:
+    """Let `compose` compose from the config groups, inside of one of Hydra's jobs too."""
+    under_way = GlobalHydra.instance().hydra  # of the job that asks; there can be only one at a time
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            yield
+    finally:
+        GlobalHydra.instance().hydra = under_way
+
+
 def swept(arguments: list[str]) -> list[str]:
     """The overrides of a command line that name several values. Raises: ConfigError."""
-    return [text for text in _read_flags(arguments)[0] if _read_override(text).is_sweep_override()]
+    return [text for text in _read_flags(arguments)[0] if read_override(text).is_sweep_override()]
 
 
 def launcher(config_name: str, arguments: list[str]) -> Launcher:
     """The launcher of a sweep that a command line asks for. Raises: ConfigError."""
     texts, multirun = _read_flags(arguments)
-    hydras = [text for text in texts if _is_hydras(_read_override(text))]
+    hydras = [text for text in texts if _is_hydras(read_override(text))]
     if not multirun or not hydras:
         return BASIC
-    with initialize_config_dir(str(CONF), version_base="1.3"):
+    with composing():
         settings = compose(config_name, hydras, return_hydra_config=True).hydra
     name, n_jobs = settings.runtime.choices["hydra/launcher"], OmegaConf.select(settings, "launcher.n_jobs")
     if (ray := OmegaConf.select(settings, "launcher.ray.init")) is None:
@@ -211,7 +225,8 @@ def _read_flags(arguments: list[str]) -> tuple[list[str], bool]:
     return flags.overrides, sweep
 
 
-def _read_override(text: str) -> Override:
+def read_override(text: str) -> Override:
+    """An override as Hydra understands it. Raises: ConfigError."""
     if "=" not in text and not text.startswith("~"):
         raise ConfigError(f"'{text}' is no override; write KEY=VALUE, as in model=resnet")
     try:
@@ -241,7 +256,7 @@ def _jobs(overrides: list[Override]) -> Iterator[list[str]]:
 
 def _check_job(config_name: str, schema: type[T], texts: list[str], known: dict[tuple[str, ...], set[str]]) -> T:
     """Check one job; `known` keeps the keys that each choice of group options gives, for the sweep's other jobs."""
-    overrides = {text: _read_override(text) for text in texts}
+    overrides = {text: read_override(text) for text in texts}
     groups = _groups(config_name)
     chosen = tuple(text for text, override in overrides.items() if _key(override) in groups)
     for text in chosen:
@@ -279,7 +294,13 @@ def _groups(config_name: str) -> set[str]:
     """The groups of a verb's defaults list, with the package that they fill: `model`, `sampler@samplers.uniform`."""
     config = OmegaConf.load(CONF / f"{config_name}.yaml")
     assert isinstance(config, DictConfig)
-    return {str(group) for entry in config.defaults if isinstance(entry, DictConfig) for group in entry}
+    groups: set[str] = set()
+    for entry in config.get("defaults", ()):
+        if isinstance(entry, DictConfig):
+            groups |= {str(group) for group in entry}
+        elif entry != "_self_":
+            groups |= _groups(entry)
+    return groups
 
 
 def _key(override: Override) -> str:

@@ -5,11 +5,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
+from hydra import compose
 from omegaconf import OmegaConf
 
-from atlantis_exp.commands.app import CONF, checked
+from atlantis_exp.commands.app import CONF, checked, composing
 from atlantis_exp.config import BaselineConfig, Config, digest, flatten, to_dict
 from atlantis_exp.media import run_colour
 
@@ -109,13 +108,8 @@ def _presets(model: str) -> tuple[str, ...]:
 
 @cache
 def _preset(name: str, choices: tuple[str, ...]) -> dict[str, str]:
-    under_way = GlobalHydra.instance().hydra  # of the job that asks; there can be only one at a time
-    GlobalHydra.instance().clear()
-    try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            return _leaves(checked(Config, compose("config", [f"experiment={name}", *choices])))
-    finally:
-        GlobalHydra.instance().hydra = under_way
+    with composing():
+        return _leaves(checked(Config, compose("config", [f"experiment={name}", *choices])))
 
 
 @cache

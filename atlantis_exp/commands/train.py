@@ -7,9 +7,15 @@ import signal
 import subprocess
 import sys
 import time
+<<<<<<< HEAD
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
+=======
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import partial
+>>>>>>> 43698a3 (Search for the best values of any keys with Optuna)
 from math import inf
 from pathlib import Path
 from types import FrameType
@@ -20,7 +26,7 @@ from atlantis_exp.config import Config, ConfigError, flatten, to_dict
 from atlantis_exp.faults import Fault
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from atlantis_exp.commands.runs import Result, RunFolder
     from atlantis_exp.training.progress import Progress
@@ -90,10 +96,17 @@ class StopRequest:
         self.signal = number
 
 
+<<<<<<< HEAD
 def train(config: Config) -> None:
     """Start the run that this config is, continue it, or print its result if it has ended.
 
     As a job of a sweep that another process runs, it writes the run's folder only: that process publishes it.
+=======
+def train(config: Config, watch: "Callable[[Trainer], bool]" = lambda _: False) -> None:
+    """Start the run that this config is, continue it, or print its result if it has ended.
+
+    watch: asked after every step; where it says so, the run is committed and left to be continued.
+>>>>>>> 43698a3 (Search for the best values of any keys with Optuna)
     """
     from atlantis_exp.commands.runs import RunFolder, settle
     from atlantis_exp.tracking.journal import adopt
@@ -122,7 +135,11 @@ def train(config: Config) -> None:
         print(result.report)
         return
     with folder.held():
+<<<<<<< HEAD
         _train(config, folder, sweep_goes_on)
+=======
+        _train(config, folder, watch)
+>>>>>>> 43698a3 (Search for the best values of any keys with Optuna)
 
 
 def train_job(config: Config) -> None:
@@ -200,6 +217,7 @@ def _final_result(config: Config, folder: "RunFolder") -> "Result | None":
     return None if result.outcome == "budget" and (budget is None or budget > result.steps) else result
 
 
+<<<<<<< HEAD
 def _watch_of(folder: "RunFolder") -> Callable[[], bool]:
     """What tells whether the process that launched this job still wants it; Slurm's jobs do without that process."""
     name, parent = job_of(), folder.parent
@@ -212,6 +230,9 @@ def _watch_of(folder: "RunFolder") -> Callable[[], bool]:
 
 
 def _train(config: Config, folder: "RunFolder", sweep_goes_on: Callable[[], bool]) -> None:
+=======
+def _train(config: Config, folder: "RunFolder", watch: "Callable[[Trainer], bool]") -> None:
+>>>>>>> 43698a3 (Search for the best values of any keys with Optuna)
     from atlantis_exp.build import build_trainer, count_update_flops
     from atlantis_exp.commands.runs import Result, provenance, published
     from atlantis_exp.commands.titles import colour, group, labels, title
@@ -247,10 +268,15 @@ def _train(config: Config, folder: "RunFolder", sweep_goes_on: Callable[[], bool
             journal.status("RUNNING")
             if config.budget.forecast != "off":
                 _check_forecast(config, trainer.counters.steps, progress)
-            outcome = trainer.run(stop)
+            watched = partial(watch, trainer)
+
+            def ends() -> bool:
+                return stop() or watched()
+
+            outcome = trainer.run(ends)
             while outcome == "interrupted" and stop.was_a_warning():
                 progress.say(f"SIGTERM: committed at step {trainer.counters.steps:,}, going on until Slurm ends it")
-                outcome = trainer.run(stop)
+                outcome = trainer.run(ends)
         except BaseException as error:
             with suppress(OSError):  # a full disk takes no status either; the next command sees that nobody holds it
                 (folder.path / TRACEBACK).write_text(traceback.format_exc())
@@ -264,6 +290,8 @@ def _train(config: Config, folder: "RunFolder", sweep_goes_on: Callable[[], bool
                 trainer.emulators.close()
         journal.status("KILLED" if outcome == "interrupted" else "FINISHED")
     if outcome == "interrupted":
+        if not stop():
+            return
         stop.leave(f"run {folder.name} is committed at step {trainer.counters.steps:,}; continue with: {command}")
     report = trainer.last_report or "no evaluation (evaluation.at_end=false)"
     counts = {

@@ -86,7 +86,7 @@ def _start_here() -> dict[str, Any]:
         **_page(START, charts),
         # Sorted by anything but time MLflow shows a sweep's runs themselves, else their collapsed parent.
         "orderByKey": "metrics.`evaluation/interquartile_mean`",
-        "searchFilter": "tags.`atlantis.kind` != 'training sweep'",
+        "searchFilter": "tags.`atlantis.kind` != 'training sweep' AND tags.`atlantis.kind` != 'search'",
     }
 
 

@@ -24,6 +24,7 @@ from atlantis_exp.config import (
     PlayConfig,
     QueryConfig,
     ReportConfig,
+    SearchConfig,
     UiConfig,
     flatten,
     parse,
@@ -32,6 +33,7 @@ from atlantis_exp.config import (
 
 SCHEMAS: dict[str, type[Any]] = {
     "config": Config,
+    "search": SearchConfig,
     "evaluate": EvaluateConfig,
     "export": ExportConfig,
     "baseline": BaselineConfig,

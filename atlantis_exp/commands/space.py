@@ -1,0 +1,88 @@
+"""What a search draws its values from: written as for Hydra's Optuna sweeper, checked before anything starts."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+from hydra.core.override_parser.types import Glob, IntervalSweep, RangeSweep
+from optuna import Trial
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+from atlantis_exp.commands.app import check, read_override
+from atlantis_exp.config import Config, ConfigError
+
+Space = Mapping[str, CategoricalDistribution | FloatDistribution | IntDistribution]
+"""The distribution of each key; a choice's values are texts, as an override has them."""
+
+_CORNERS = 32  # configs that are composed before a search starts, at 0.1 s each; a larger space is checked by its edges
+
+
+def read_space(texts: Mapping[str, str], closed: set[str]) -> Space:
+    """The distributions that the texts describe: `choice(a, b)`, `tag(log, interval(1e-5, 1e-3))`.
+
+    closed: what no searched key may begin with.
+
+    Raises:
+        ConfigError: for such a key, and for a text that is no set of values.
+    """
+    return {key: _read(key, text, closed) for key, text in texts.items()}
+
+
+def _read(key: str, text: str, closed: set[str]) -> CategoricalDistribution | FloatDistribution | IntDistribution:
+    if key.split(".")[0] in closed:
+        raise ConfigError(
+            f"{key}={text}: not to be searched; it says how trials are run or measured, not what is trained"
+        )
+    override = read_override(f"{key}={text}")
+    values = override.value()
+    if not override.is_sweep_override() or isinstance(values, Glob):
+        raise ConfigError(f"{key}={text}: no set of values; write choice(a, b), range(1, 9) or interval(0.1, 0.9)")
+    try:
+        if isinstance(values, IntervalSweep):
+            low, high, step = values.start, values.end, None
+        elif isinstance(values, RangeSweep):
+            if not (numbers := sorted(values.range())):
+                raise ValueError("there is no number in it")
+            low, high, step = numbers[0], numbers[-1], abs(values.step)
+        else:
+            return CategoricalDistribution(list(dict.fromkeys(override.sweep_string_iterator())))
+        is_log = "log" in values.tags
+        if isinstance(low, int) and isinstance(high, int):
+            return IntDistribution(low, high, is_log, int(step or 1))
+        assert low is not None
+        assert high is not None
+        return FloatDistribution(low, high, is_log, step)
+    except ValueError as error:
+        raise ConfigError(f"{key}={text}: {error}") from None
+
+
+def check_space(space: Space, overrides: Sequence[str]) -> None:
+    """Compose the configs at the corners of a space.
+
+    Raises:
+        ConfigError: for the first that is not valid, or a key that has a value already.
+    """
+    fixed = {text.split("=")[0] for text in overrides}
+    if twice := sorted(fixed & space.keys()):
+        raise ConfigError(f"{twice[0]}: has one value and is to be searched; leave one of them away")
+    ends = {
+        key: drawn.choices if isinstance(drawn, CategoricalDistribution) else (drawn.low, drawn.high)
+        for key, drawn in space.items()
+    }
+    is_small = math.prod(map(len, ends.values())) <= _CORNERS
+    for varied in [None] if is_small else ends:
+        values = {key: end if varied in (None, key) else end[:1] for key, end in ends.items()}
+        check(
+            "config", Config, ["-m", *overrides, *(f"{key}={','.join(map(str, end))}" for key, end in values.items())]
+        )
+
+
+def suggest(trial: Trial, space: Space) -> None:
+    """Draw a trial's values; those that it has been given already stay."""
+    for key, drawn in space.items():
+        match drawn:
+            case CategoricalDistribution():
+                trial.suggest_categorical(key, drawn.choices)
+            case IntDistribution():
+                trial.suggest_int(key, drawn.low, drawn.high, step=drawn.step, log=drawn.log)
+            case FloatDistribution():
+                trial.suggest_float(key, drawn.low, drawn.high, step=drawn.step, log=drawn.log)
