@@ -365,8 +365,7 @@ class _Page:
     def update(self) -> None:
         """Write how the trials stand, if no other process does."""
         if self._journal is None and not self._session.folder.is_held:
-            with suppress(Fault):
-                self._take()
+            self._take()
         if self._journal is not None:
             self._write(self._journal)
 
@@ -377,13 +376,15 @@ class _Page:
         from atlantis_exp.tracking.journal import read_commit
 
         session, config = self._session, self._session.config
-        self._held.enter_context(session.folder.held())
-        commit = read_commit(session.folder.path)
+        try:
+            self._held.enter_context(session.folder.held())
+        except Fault:
+            return  # another process was faster
         shown = {**labels(f"search {' '.join(session.space)}", run_colour("search")), "atlantis.kind": "search"}
         journal = self._held.enter_context(
             published(session.folder, config.tracking, Path(config.paths.outputs), shown)
         )
-        if commit is not None and commit.offset:
+        if (commit := read_commit(session.folder.path)) is not None and commit.offset:
             journal.load_state_dict({"offset": commit.offset, "time": commit.updated})
         else:
             journal.params({f"space/{key}": text for key, text in session.texts.items()})

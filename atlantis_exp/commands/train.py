@@ -7,15 +7,10 @@ import signal
 import subprocess
 import sys
 import time
-<<<<<<< HEAD
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
-=======
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
->>>>>>> 43698a3 (Search for the best values of any keys with Optuna)
 from math import inf
 from pathlib import Path
 from types import FrameType
@@ -26,7 +21,7 @@ from atlantis_exp.config import Config, ConfigError, flatten, to_dict
 from atlantis_exp.faults import Fault
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
     from atlantis_exp.commands.runs import Result, RunFolder
     from atlantis_exp.training.progress import Progress
@@ -96,17 +91,12 @@ class StopRequest:
         self.signal = number
 
 
-<<<<<<< HEAD
-def train(config: Config) -> None:
-    """Start the run that this config is, continue it, or print its result if it has ended.
-
-    As a job of a sweep that another process runs, it writes the run's folder only: that process publishes it.
-=======
 def train(config: Config, watch: "Callable[[Trainer], bool]" = lambda _: False) -> None:
     """Start the run that this config is, continue it, or print its result if it has ended.
 
+    As a job of a sweep that another process runs, it writes the run's folder only: that process publishes it.
+
     watch: asked after every step; where it says so, the run is committed and left to be continued.
->>>>>>> 43698a3 (Search for the best values of any keys with Optuna)
     """
     from atlantis_exp.commands.runs import RunFolder, settle
     from atlantis_exp.tracking.journal import adopt
@@ -135,11 +125,7 @@ def train(config: Config, watch: "Callable[[Trainer], bool]" = lambda _: False) 
         print(result.report)
         return
     with folder.held():
-<<<<<<< HEAD
-        _train(config, folder, sweep_goes_on)
-=======
-        _train(config, folder, watch)
->>>>>>> 43698a3 (Search for the best values of any keys with Optuna)
+        _train(config, folder, sweep_goes_on, watch)
 
 
 def train_job(config: Config) -> None:
@@ -217,7 +203,6 @@ def _final_result(config: Config, folder: "RunFolder") -> "Result | None":
     return None if result.outcome == "budget" and (budget is None or budget > result.steps) else result
 
 
-<<<<<<< HEAD
 def _watch_of(folder: "RunFolder") -> Callable[[], bool]:
     """What tells whether the process that launched this job still wants it; Slurm's jobs do without that process."""
     name, parent = job_of(), folder.parent
@@ -229,10 +214,9 @@ def _watch_of(folder: "RunFolder") -> Callable[[], bool]:
     return lambda: sweep.status == "RUNNING" and sweep.is_held
 
 
-def _train(config: Config, folder: "RunFolder", sweep_goes_on: Callable[[], bool]) -> None:
-=======
-def _train(config: Config, folder: "RunFolder", watch: "Callable[[Trainer], bool]") -> None:
->>>>>>> 43698a3 (Search for the best values of any keys with Optuna)
+def _train(
+    config: Config, folder: "RunFolder", sweep_goes_on: Callable[[], bool], watch: "Callable[[Trainer], bool]"
+) -> None:
     from atlantis_exp.build import build_trainer, count_update_flops
     from atlantis_exp.commands.runs import Result, provenance, published
     from atlantis_exp.commands.titles import colour, group, labels, title
