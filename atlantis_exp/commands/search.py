@@ -99,9 +99,8 @@ def _open(config: SearchConfig, searched: Sequence[str], fixed: Sequence[str]) -
         raise ConfigError("nothing to search: give a key several values, as in optimizer=adam,rmsprop")
     overrides = [text for text in fixed if text.lstrip("+~").split("=")[0].split(".")[0] not in _OWN]
     space = read_space(texts, _CLOSED)
-    check_space(space, overrides)
-    (base,) = check("config", Config, overrides)
-    facts = {"space": texts, "training": base.science(), "budget.steps": config.budget.steps}
+    corner = check_space(space, overrides)
+    facts = {"space": texts, "training": corner.science(), "budget.steps": config.budget.steps}
     name = config.name or f"search-{digest(facts)}"
     folder = RunFolder(Path(config.paths.outputs) / "searches" / name)
     folder.path.mkdir(parents=True, exist_ok=True)

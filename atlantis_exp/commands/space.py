@@ -55,8 +55,8 @@ def _read(key: str, text: str, closed: set[str]) -> CategoricalDistribution | Fl
         raise ConfigError(f"{key}={text}: {error}") from None
 
 
-def check_space(space: Space, overrides: Sequence[str]) -> None:
-    """Compose the configs at the corners of a space.
+def check_space(space: Space, overrides: Sequence[str]) -> Config:
+    """Compose the configs at the corners of a space; returns the first of them.
 
     Raises:
         ConfigError: for the first that is not valid, or a key that has a value already.
@@ -69,11 +69,12 @@ def check_space(space: Space, overrides: Sequence[str]) -> None:
         for key, drawn in space.items()
     }
     is_small = math.prod(map(len, ends.values())) <= _CORNERS
+    corners: list[Config] = []
     for varied in [None] if is_small else ends:
-        values = {key: end if varied in (None, key) else end[:1] for key, end in ends.items()}
-        check(
-            "config", Config, ["-m", *overrides, *(f"{key}={','.join(map(str, end))}" for key, end in values.items())]
-        )
+        chosen = {key: end if varied in (None, key) else end[:1] for key, end in ends.items()}
+        swept = [f"{key}={','.join(map(str, end))}" for key, end in chosen.items()]
+        corners += check("config", Config, ["-m", *overrides, *swept])
+    return corners[0]
 
 
 def suggest(trial: Trial, space: Space) -> None:
