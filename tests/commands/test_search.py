@@ -104,7 +104,7 @@ def test_a_space_is_written_as_for_hydras_optuna_sweeper(text: str, drawn: BaseD
         ("", "env.num_envs=int(interval(1,40))", "training.learn_start=20: nothing would be learned"),
         (  # too many corners to try them all
             "",
-            "optimizer.lr=0.1,0.2 env.stack=1,2,3,4 objective.n_step=1,2,3,4 env.sticky=0,2",
+            "env.sticky=0,2 optimizer.lr=0.1,0.2 env.stack=1,2,3,4 objective.n_step=1,2,3,4",
             "env.sticky=2: should be less than or equal to 1",
         ),
     ],
