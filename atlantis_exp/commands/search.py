@@ -224,7 +224,7 @@ class _Session:
 
         overrides = [*self.overrides, *_values(trial)]
         watch = _Watch(trial, stop, set(self.trials[trial.number].intermediate_values), self.folder.name)
-        score = None
+        score, error = None, ""
         try:
             score = self._score(trial, overrides, watch)
         except Fault as fault:
@@ -234,15 +234,15 @@ class _Session:
         except (RuntimeError, MemoryError) as unforeseen:  # of torch, above all where memory is short
             traceback.print_exc()
             error = f"{type(unforeseen).__name__}: {unforeseen}"
-        if score is not None:
+        if error:
+            trial.set_user_attr("error", error)
+            self.study.tell(trial.number, state=TrialState.FAIL)
+        elif score is not None:
             self.study.tell(trial.number, score)
         elif watch.pruned:
             self.study.tell(trial.number, state=TrialState.PRUNED)
-        elif watch.stopped:
-            return
         else:
-            trial.set_user_attr("error", error)
-            self.study.tell(trial.number, state=TrialState.FAIL)
+            return
         self._print(trial.number)
 
     def _score(self, trial: "Trial", overrides: Sequence[str], watch: "_Watch") -> float | None:
@@ -269,9 +269,10 @@ class _Session:
             adopt(run.path, self.folder.path)
         with _typed(overrides):
             train(config, watch)
-        result = run.result
-        if watch.pruned or watch.stopped or result is None:
+        if watch.pruned or watch.stopped:
             return None
+        result = run.result
+        assert result is not None
         most = config.budget.steps
         if most is not None and result.steps >= most + config.env.num_envs:
             raise Fault(f"run {run.name} was trained for {result.steps:,} steps already, more than budget.steps={most}")
