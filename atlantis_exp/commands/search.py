@@ -424,7 +424,7 @@ def _draw(study: "Study") -> dict[str, bytes]:
     """Which keys matter, which values go together, and how the search went, as PNGs by name.
 
     Importance is Optuna's default, PED-ANOVA: it asks what tells the better trials from all, in milliseconds, and needs
-    no forest of trees to be fitted as fANOVA does, which with a few dozen trials says more of the forest than of them.
+    no forest of trees to be fitted as fANOVA does.
     """
     import matplotlib as mpl
 
