@@ -41,6 +41,7 @@ class StopRequest:
 
     def __init__(self, seconds: float | None = None, sweep_goes_on: Callable[[], bool] = lambda: True) -> None:
         self.signal: int | None = None
+        self._is_warned = False  # by Slurm
         self._deadline = inf if seconds is None else time.monotonic() + seconds
         self._sweep_goes_on = sweep_goes_on
         self._sweep_has_ended = False
@@ -52,14 +53,12 @@ class StopRequest:
         if now - self._looked >= _LOOK_SECONDS:
             self._looked = now
             self._sweep_has_ended = self._sweep_has_ended or not self._sweep_goes_on()
-        return self.signal is not None or self._sweep_has_ended or now >= self._deadline
+        return self.signal is not None or self._is_warned or self._sweep_has_ended or now >= self._deadline
 
     def was_a_warning(self) -> bool:
         """Whether the run is to go on once it is committed; forgets the warning."""
-        if self.signal != signal.SIGTERM or "SLURM_JOB_ID" not in os.environ:
-            return False
-        self.signal = None
-        return True
+        was_warned, self._is_warned = self._is_warned, False
+        return was_warned and self.signal is None
 
     def leave(self, message: str) -> NoReturn:
         """End the process as the request wants it; raises Fault for the end of the time, so that a sweep goes on."""
@@ -88,7 +87,10 @@ class StopRequest:
         if self.signal is not None and number == signal.SIGINT:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
             signal.raise_signal(signal.SIGINT)
-        self.signal = number
+        if number == signal.SIGTERM and "SLURM_JOB_ID" in os.environ:
+            self._is_warned = True  # apart, as a SIGUSR2 before it still means that the job is to be requeued
+        else:
+            self.signal = number
 
 
 def train(config: Config, watch: "Callable[[Trainer], bool]" = lambda _: False) -> None:

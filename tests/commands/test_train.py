@@ -215,6 +215,26 @@ def test_under_slurm_sigterm_is_a_warning_and_sigusr2_goes_on_to_the_handler_bef
         signal.signal(signal.SIGUSR2, before)
 
 
+def test_under_slurm_the_sigterm_of_time_that_is_up_does_not_undo_the_sigusr2_before_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("SLURM_JOB_ID", "7")
+    tape = []
+    before = signal.signal(signal.SIGUSR2, lambda number, _: tape.append(number))
+    try:
+        stop = StopRequest()
+        with stop.installed():
+            signal.raise_signal(signal.SIGUSR2)
+            signal.raise_signal(signal.SIGTERM)  # the commit took long
+            assert stop()
+            assert not stop.was_a_warning()
+            with pytest.raises(SystemExit):
+                stop.leave("done")
+        assert tape == [signal.SIGUSR2]
+    finally:
+        signal.signal(signal.SIGUSR2, before)
+
+
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 64 MiB, where mounting one is allowed."""
