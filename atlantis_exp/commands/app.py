@@ -4,6 +4,7 @@ import argparse
 import itertools
 import os
 import re
+import shutil
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +20,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
@@ -141,16 +142,17 @@ def check(config_name: str, schema: type[T], arguments: list[str]) -> list[T]:
     for override in overrides:
         if override.is_sweep_override() and not multirun:
             raise ConfigError(f"{override.input_line}: several values are a sweep; add -m")
-    hydras = [str(override.input_line) for override in overrides if _is_hydras(override)]
+    hydras = [override for override in overrides if _is_hydras(override)]
     overrides = [override for override in overrides if not _is_hydras(override)]
     known: dict[tuple[str, ...], set[str]] = {}
     try:
         with composing():
             if hydras:
-                _check_launcher(compose(config_name, hydras, return_hydra_config=True))
+                _check_launcher(config_name, hydras)
             return [_check_job(config_name, schema, job, known) for job in _jobs(overrides)]
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(" ".join(re.split("Config search path|full_key:", str(error))[0].split())) from None
+        reason = f": {error.__cause__}" if isinstance(error.__cause__, OmegaConfBaseException) else ""
+        raise ConfigError(" ".join(re.split("Config search path|full_key:", f"{error}{reason}")[0].split())) from None
 
 
 @contextmanager
@@ -197,12 +199,28 @@ def job_of() -> str | None:
     return None if Launcher(name).is_basic else name
 
 
-def _check_launcher(composed: DictConfig) -> None:
-    name, target = composed.hydra.runtime.choices["hydra/launcher"], composed.hydra.launcher._target_
+def _check_launcher(config_name: str, overrides: list[Override]) -> None:
+    """Check what the command line tells Hydra itself, above all of the launcher."""
+    texts = {str(override.input_line): override for override in overrides}
+    choices = [text for text, override in texts.items() if "/" in override.key_or_group]
     try:
+        settings = compose(config_name, choices, return_hydra_config=True).hydra
+        name, target = settings.runtime.choices["hydra/launcher"], settings.launcher._target_
         import_module(target.rpartition(".")[0])
     except ImportError:
         raise ConfigError(f"hydra/launcher={name}: needs pip install 'atlantis-exp[{name}]'") from None
+    except MissingConfigException as error:  # the plugin's own, which the preset is made of
+        if error.missing_cfg_file != "hydra/launcher/submitit_slurm":
+            raise
+        raise ConfigError("hydra/launcher=slurm: needs pip install 'atlantis-exp[slurm]'") from None
+    if target.endswith(".SlurmLauncher") and shutil.which("srun") is None:
+        raise ConfigError(f"hydra/launcher={name}: there is no srun here; submit from a machine of the cluster")
+    keys = {f"hydra.launcher.{key}" for key in settings.launcher}
+    for text, override in texts.items():
+        key = ".".join(override.key_or_group.split(".")[:3])  # what is below, the user names
+        if key.startswith("hydra.launcher.") and key not in keys:
+            raise ConfigError(f"{text}: no such key; {nearest(key, keys)}")
+    compose(config_name, list(texts), return_hydra_config=True)
 
 
 def _read_flags(arguments: list[str]) -> tuple[list[str], bool]:

@@ -19,6 +19,7 @@ import numpy as np
 from atlantis_exp.commands.app import BASIC, Launcher
 from atlantis_exp.commands.live import LiveTable
 from atlantis_exp.commands.runs import RunFolder, State, provenance, published, settle
+from atlantis_exp.commands.slurm import all_awaited
 from atlantis_exp.commands.titles import colour, group, title
 from atlantis_exp.config import Config, digest
 from atlantis_exp.faults import Fault
@@ -150,7 +151,7 @@ def _jobs(
     SIGINT and SIGTERM have them commit while this process waits; then it exits as a run would.
     """
     if launcher.name not in ("joblib", "ray"):  # what a cluster was given, it does
-        with _shown(configs, folders):
+        with _shown(configs, folders), all_awaited() if launcher.name == "slurm" else nullcontext():
             yield
         return
 

@@ -167,7 +167,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("--experimental-rerun=x.pickle", "--experimental-rerun", "overrides"),
     ("--info everything", "--info", "defaults"),
     ("hydra.foo=1", "hydra.foo", ""),
-    ("hydra/launcher=slurm", "hydra/launcher", "basic"),
+    ("hydra/launcher=lsf", "hydra/launcher", "basic"),
     ("hydra.mode=FOO", "hydra.mode=FOO", ""),
     # writing
     ("model", "'model'", "KEY=VALUE"),
