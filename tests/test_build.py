@@ -19,3 +19,21 @@ def test_the_operations_of_an_update_are_those_counted_by_hand(tiny: Callable[..
     assert count_update_flops(dqn) == 4 * (sample + forward)
     assert count_update_flops(double) == 4 * (sample + 2 * forward)
     assert 4 * 1.8e9 < count_update_flops(tiny("model=resnet", "env.size=159")) < 4 * 1.9e9
+
+
+def test_a_run_without_checkpoints_plays_from_the_weights_of_its_evaluations(tiny: Callable[..., Config]) -> None:
+    config = tiny()
+    train(config)
+    folder = Path(config.paths.outputs) / "runs" / config.run_name()
+
+    def stored(weights: str) -> tuple[dict[str, list[Any]], int]:
+        content, step = stored_weights(config, folder, weights)
+        return {name: tensor.tolist() for name, tensor in safetensors.torch.load(content).items()}, step
+
+    with_checkpoints = [stored("latest"), stored("best")]
+    shutil.rmtree(folder / "checkpoints")
+    assert [stored("latest"), stored("best")] == with_checkpoints
+    assert with_checkpoints[0][1] == 160
+    shutil.rmtree(folder)
+    with pytest.raises(Fault, match="neither a checkpoint nor an evaluation"):
+        stored("latest")

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, TextIO, TypeVar
@@ -19,7 +20,7 @@ from atlantis_exp.config import Config, ConfigError, TrackingConfig, flatten, ne
 from atlantis_exp.faults import Fault
 from atlantis_exp.media import score_histogram
 from atlantis_exp.tracking.journal import Commit, Journal, JournalError, Status, read_commit, write_file
-from atlantis_exp.tracking.store import Publisher, Store, unfinished
+from atlantis_exp.tracking.store import Publisher, Store, brought, unfinished
 from atlantis_exp.training.evaluation import Evaluation
 
 _DRAIN_SECONDS = 20.0  # that a command waits for MLflow at its end; `settle` sends what is missing then
@@ -146,7 +147,8 @@ def settle(outputs: Path, continued: Path | None = None) -> None:
     for path in sorted(outputs.glob("*/*/commit.json")):
         folder = RunFolder(path.parent)
         try:
-            if folder.status == "RUNNING" and not folder.is_held:
+            runs_here = folder.status == "RUNNING" and not brought(folder.path)
+            if runs_here and not folder.is_held:
                 with suppress(Fault), folder.held():
                     Journal(folder.path).status("KILLED")
                     print(f"run {folder.name} was killed; the command that started it continues it")
@@ -287,6 +289,11 @@ def _locked(file: TextIO) -> bool:
 
 def _read(path: Path, schema: type[T]) -> T | None:
     try:
-        return TypeAdapter(schema).validate_json(path.read_bytes(), strict=True) if path.exists() else None
+        return _adapter(schema).validate_json(path.read_bytes(), strict=True) if path.exists() else None
     except ValidationError:
         raise Fault(f"{path} is damaged: remove it and issue the run's command again, which writes it anew") from None
+
+
+@cache
+def _adapter(schema: type[T]) -> TypeAdapter[T]:
+    return TypeAdapter(schema)
