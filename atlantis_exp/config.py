@@ -10,7 +10,6 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping
-from functools import cache
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
@@ -636,14 +635,9 @@ def parse(schema: type[T], tree: Mapping[str, Any]) -> T:
     """
     try:
         # Through JSON: its strict mode takes a list for a tuple, which is all that YAML can write.
-        return _adapter(schema).validate_json(json.dumps(tree))
+        return TypeAdapter(schema).validate_json(json.dumps(tree))
     except ValidationError as error:
         raise ConfigError(_explain(error.errors(include_url=False), tree)) from None
-
-
-@cache
-def _adapter(schema: type[T]) -> TypeAdapter[T]:
-    return TypeAdapter(schema)
 
 
 def to_dict(config: Any) -> dict[str, Any]:

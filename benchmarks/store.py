@@ -93,9 +93,9 @@ _MEANS = {"mean_20": 20, "mean_100": 100, "best_100": 100}
 
 
 def publish_nothing(outputs: Path) -> None:
-    """Note in every folder that the local store has it."""
+    """Note in every run's folder that the local store has it."""
     address = Store(outputs).address
-    for path in outputs.glob("*/*/commit.json"):
+    for path in outputs.glob("runs/*/commit.json"):
         folder = path.parent
         if (commit := read_commit(folder)) is not None:
             state = standing(small_files(folder, commit, is_server=False))

@@ -1,9 +1,17 @@
-"""What the composition root counts."""
+"""What the composition root counts, and which weights of a stored run it plays."""
 
+import shutil
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
-from atlantis_exp.build import count_update_flops
+import pytest
+import safetensors.torch
+
+from atlantis_exp.build import count_update_flops, stored_weights
+from atlantis_exp.commands.train import train
 from atlantis_exp.config import Config
+from atlantis_exp.faults import Fault
 
 
 def test_the_operations_of_an_update_are_those_counted_by_hand(tiny: Callable[..., Config]) -> None:
@@ -21,6 +29,7 @@ def test_the_operations_of_an_update_are_those_counted_by_hand(tiny: Callable[..
     assert 4 * 1.8e9 < count_update_flops(tiny("model=resnet", "env.size=159")) < 4 * 1.9e9
 
 
+@pytest.mark.slow
 def test_a_run_without_checkpoints_plays_from_the_weights_of_its_evaluations(tiny: Callable[..., Config]) -> None:
     config = tiny()
     train(config)

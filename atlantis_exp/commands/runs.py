@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, TextIO, TypeVar
@@ -64,12 +63,12 @@ class RunFolder:
     @property
     def config(self) -> dict[str, Any]:
         """The composed config, empty before the run's start."""
-        return _read(self.path / "config.json", dict[str, Any]) or {}
+        return _read(self.path / "config.json", _CONFIG) or {}
 
     @property
     def result(self) -> Result | None:
         """How the run ended, None before its end."""
-        return _read(self.path / "result.json", Result)
+        return _read(self.path / "result.json", _RESULT)
 
     @property
     def status(self) -> Status | None:
@@ -287,13 +286,12 @@ def _locked(file: TextIO) -> bool:
     return True
 
 
-def _read(path: Path, schema: type[T]) -> T | None:
+def _read(path: Path, schema: TypeAdapter[T]) -> T | None:
     try:
-        return _adapter(schema).validate_json(path.read_bytes(), strict=True) if path.exists() else None
+        return schema.validate_json(path.read_bytes(), strict=True) if path.exists() else None
     except ValidationError:
         raise Fault(f"{path} is damaged: remove it and issue the run's command again, which writes it anew") from None
 
 
-@cache
-def _adapter(schema: type[T]) -> TypeAdapter[T]:
-    return TypeAdapter(schema)
+_RESULT = TypeAdapter(Result)
+_CONFIG = TypeAdapter(dict[str, Any])

@@ -17,6 +17,7 @@ from typing import Any, Literal, Protocol, get_args
 from uuid import uuid4
 
 from pydantic import TypeAdapter, ValidationError
+from pydantic_core import from_json
 
 Status = Literal["SCHEDULED", "RUNNING", "FINISHED", "FAILED", "KILLED"]
 NOTE = "mlflow.note.content"
@@ -381,7 +382,7 @@ def curve(folder: Path, keys: Sequence[str], points: int = 500) -> Iterator[Metr
 
 
 def _metrics(line: bytes) -> Metrics:
-    fields = json.loads(line)
+    fields = from_json(line)  # four times as fast as `json`
     del fields["kind"]
     return Metrics(**fields)
 

@@ -25,7 +25,7 @@ from atlantis_exp.commands.sync import sync
 from atlantis_exp.config import ConfigError, SyncConfig
 from atlantis_exp.faults import Fault
 from atlantis_exp.tracking import travel
-from atlantis_exp.tracking.journal import Commit, Journal, adopt, commit_bytes, read_commit
+from atlantis_exp.tracking.journal import Commit, Journal, adopt, commit_bytes, read_commit, write_file
 from atlantis_exp.tracking.store import Store, publish, standing, unfinished
 
 REPOSITORY = Path(__file__).parents[2]
@@ -240,7 +240,7 @@ def test_a_bringing_that_breaks_off_anywhere_is_made_good(
     options = (f"from={address}", "tracking.experiment=broken")
     run = a_sweep_of_one(cluster, "broken")
     synced(cluster, f"to={address}", "tracking.experiment=broken")
-    write_file, attempts = travel.write_file, 0
+    attempts = 0
     for fails_at in range(20):
         attempts, writes = attempts + 1, iter(range(20))
 

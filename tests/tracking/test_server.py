@@ -61,21 +61,19 @@ def database() -> Iterator[str]:
     folder = Path(tempfile.mkdtemp(prefix="postgres-"))
     programs, data = PROGRAMS[-1].parent, folder / "data"
     (folder / "password").write_text("secret%2F")
-    owner: dict[str, Any] = {"cwd": folder, "check": True, "stdout": subprocess.DEVNULL}
+    as_owner: dict[str, Any] = {"cwd": folder, "check": True, "stdout": subprocess.DEVNULL}
     if os.geteuid() == 0:  # as which it refuses to run
-        owner["user"] = "postgres"
+        as_owner["user"] = "postgres"
         for path in (folder, folder / "password"):
             shutil.chown(path, "postgres")
     options = f"-c listen_addresses='' -c unix_socket_directories={folder} -c fsync=off"
     try:
-        subprocess.run(
-            [programs / "initdb", "-D", data, "-U", "team", "--pwfile", folder / "password", "-A", "scram-sha-256"],
-            **owner,
-        )
-        control = [programs / "pg_ctl", "-D", data, "-w", "-l", folder / "log"]
-        subprocess.run([*control, "-o", options, "start"], **owner)
+        account: tuple[str | Path, ...] = ("-U", "team", "--pwfile", folder / "password", "-A", "scram-sha-256")
+        subprocess.run((programs / "initdb", "-D", data, *account), **as_owner)
+        control: tuple[str | Path, ...] = (programs / "pg_ctl", "-D", data, "-w", "-l", folder / "log")
+        subprocess.run((*control, "-o", options, "start"), **as_owner)
         yield f"postgresql+psycopg2://team:secret%252F@/postgres?host={folder}"
-        subprocess.run([*control, "-m", "immediate", "stop"], **owner)
+        subprocess.run((*control, "-m", "immediate", "stop"), **as_owner)
     finally:
         shutil.rmtree(folder)
 
