@@ -57,6 +57,8 @@ _HOME = "published.json"
 
 ORIGIN = "origin.json"
 """Where a folder that was brought from a server notes how far it is one with the run there."""
+BESIDE = ("config.json", "result.json", TRACEBACK)
+"""The small files that a run folder may hold beside its `commit.json`."""
 STANDING = "atlantis.standing"
 """The tag of a run whose folder is on the server as of a commit: `standing` of its small files."""
 TRAVELS = "run_folder"
@@ -353,7 +355,7 @@ def small_files(folder: Path, commit: Commit, is_server: bool = True) -> dict[st
 
     A local store is beside the folder and needs none but the commit.
     """
-    names = [name for name in ("config.json", "result.json") if is_server and (folder / name).exists()]
+    names = [name for name in BESIDE if is_server and (folder / name).exists()]
     return {"commit.json": commit_bytes(commit), **{name: (folder / name).read_bytes() for name in names}}
 
 

@@ -25,6 +25,7 @@ from atlantis_exp.tracking.journal import (
     write_file,
 )
 from atlantis_exp.tracking.store import (
+    BESIDE,
     CHUNK,
     ORIGIN,
     STANDING,
@@ -43,7 +44,6 @@ _log = logging.getLogger(__name__)
 
 _PLACE = r"([a-z]+)/[A-Za-z0-9][A-Za-z0-9_.,~+=@-]{0,199}"
 _JOURNAL = f"{TRAVELS}/journal"
-_SMALL_FILES = ("commit.json", "config.json", "result.json")
 
 Outcome = Literal["brought", "ahead", "other", "growing"]
 """What became of a run: it is here now, further along here, has another's place, or has not all arrived yet."""
@@ -81,7 +81,7 @@ def bring(run: StoredRun, folder: Path, store: Store, listed: Collection[str]) -
     client = store.client
     files = store.files(client.get_run(run.run_id).info.artifact_uri)
     names = files.names(TRAVELS)
-    small = {name: files.read(f"{TRAVELS}/{name}") for name in _SMALL_FILES if name in names}
+    small = {name: files.read(f"{TRAVELS}/{name}") for name in ("commit.json", *BESIDE) if name in names}
     if standing(small) != run.tags.get(STANDING):
         return "growing"
     commit = commit_of(small["commit.json"])
@@ -106,7 +106,7 @@ def bring(run: StoredRun, folder: Path, store: Store, listed: Collection[str]) -
     records = (record for _, record in read(folder, start, commit.offset))
     named = {record.path: record for record in records if isinstance(record, Artifact | Image | Model)}
     _bring_files(run, folder, store, files, named)
-    for name in ("config.json", "result.json"):
+    for name in BESIDE:
         if name in small:
             write_file(folder / name, small[name])
         else:
