@@ -179,6 +179,7 @@ def test_runs_go_to_a_server_and_come_back_equal_and_once_and_then_what_is_new(
     assert sent.count(f"{commit.offset:012d}.gz") == 1
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_where_it_is_and_its_copy_is_nobodys_to_end_or_replace(
     tmp_path: Path, server: tuple[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
