@@ -39,7 +39,7 @@ from atlantis_exp.networks.resnet import ResNetDQN
 from atlantis_exp.networks.resnet_fast import ResNetFast
 from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.replay.samplers import PrioritizedSampler, Sampler, TopHalfSampler, UniformSampler
-from atlantis_exp.tracking.journal import Tracker
+from atlantis_exp.tracking.journal import Model, Tracker, read
 from atlantis_exp.training.actor import Actor, ConstantActor, EpsilonGreedy, PersonActor, RandomActor
 from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints
 from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate, replay
@@ -283,6 +283,8 @@ def film_episode(episode: Episode, actor: Actor, env: cfg.EnvConfig) -> bytes:
 def stored_weights(config: cfg.Config, folder: Path, weights: str) -> tuple[bytes, int]:
     """A stored run's network as safetensors, from its last commit or its best evaluation, and that step.
 
+    A folder without checkpoints, as one that was brought from a server, has those of its evaluations.
+
     Raises:
         Fault: where the run has no such weights.
     """
@@ -291,7 +293,11 @@ def stored_weights(config: cfg.Config, folder: Path, weights: str) -> tuple[byte
     except CheckpointError as error:
         raise Fault(f"run {folder.name}: {error}") from error
     if state is None:
-        raise Fault(f"run {folder.name} has no checkpoint yet")
+        models = [record for _, record in read(folder) if isinstance(record, Model)]
+        stored = [model for model in models if weights == "latest" or model.best]
+        if not stored:
+            raise Fault(f"run {folder.name} has neither a checkpoint nor an evaluation yet")
+        return (folder / "artifacts" / stored[-1].path).read_bytes(), stored[-1].step
     if weights == "latest":
         return safetensors.torch.save(state["learner"]["network"]), int(state["counters"]["steps"])
     path = folder / "artifacts" / "best.safetensors"

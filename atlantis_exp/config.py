@@ -287,7 +287,7 @@ class EvaluationConfig:
 class TrackingConfig:
     """Where and how densely a run is recorded."""
 
-    name: Literal["mlflow", "none"]
+    name: Literal["mlflow", "server", "none"]
     uri: str | None  # of an MLflow server; null: the outputs folder's own database
     experiment: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 _.-]{0,99}$")]
     every_steps: Count  # steps between two points of a curve
@@ -296,12 +296,7 @@ class TrackingConfig:
     commit_seconds: Positive  # seconds between two checkpoints at the most
 
     def __post_init__(self) -> None:
-        # It is written into files, which is no place for a password.
-        if self.uri is not None and not re.fullmatch(r"https?://[^\s@?#]+", self.uri):
-            raise ConfigError(
-                "tracking.uri: should be null or a server's address, as in http://127.0.0.1:5000; user and password "
-                "belong into the environment, as MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD"
-            )
+        _check_server("tracking.uri", self.uri)
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
@@ -319,11 +314,7 @@ class BudgetConfig:
     @property
     def seconds(self) -> int | None:
         """`wall_clock` in seconds, 0 where it is not readable."""
-        if self.wall_clock is None:
-            return None
-        parts = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m(?:in)?)?(?:(\d+)s?)?", str(self.wall_clock))
-        hours, minutes, seconds = (int(part or 0) for part in parts.groups()) if parts else (0, 0, 0)
-        return 3600 * hours + 60 * minutes + seconds
+        return None if self.wall_clock is None else _seconds(self.wall_clock)
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
@@ -557,6 +548,32 @@ class UiConfig:
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
+class SyncConfig:
+    """Run folders and an MLflow store or server, brought up to each other."""
+
+    every: str | Count | None  # time between two looks, a number alone in seconds; null: one look
+    to: str | None  # a server's address: this one instead of the store that `tracking` names
+    from_: Annotated[str | None, Field(alias="from")]  # a server's address: its runs come here
+    tracking: TrackingConfig
+    paths: PathsConfig
+
+    def __post_init__(self) -> None:
+        _check_server("to", self.to)
+        _check_server("from", self.from_)
+        if self.to and self.from_:
+            raise ConfigError(f"from={self.from_}: goes the other way than to={self.to}; choose one")
+        if self.tracking.name == "none":
+            raise ConfigError("tracking=none: names no store to bring up to date; choose tracking=mlflow or server")
+        if self.seconds == 0:
+            raise ConfigError(f"every={self.every}: no time; write it as in 30s, 10min or 1h30m")
+
+    @property
+    def seconds(self) -> int | None:
+        """`every` in seconds, 0 where it is not readable."""
+        return None if self.every is None else _seconds(self.every)
+
+
+@dataclass(config=_STRICT, kw_only=True, frozen=True)
 class ReportConfig:
     """The table of what a store holds."""
 
@@ -575,6 +592,22 @@ class CompareConfig:
     seed: Annotated[int, Field(ge=0)]  # of the bootstrap
     tracking: TrackingConfig
     paths: PathsConfig
+
+
+def _seconds(text: str | int) -> int:
+    """Seconds of a time such as 90, 90s, 10min, 3h or 1h30m, 0 where it is not readable."""
+    parts = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m(?:in)?)?(?:(\d+)s?)?", str(text))
+    hours, minutes, seconds = (int(part or 0) for part in parts.groups()) if parts else (0, 0, 0)
+    return 3600 * hours + 60 * minutes + seconds
+
+
+def _check_server(key: str, uri: str | None) -> None:
+    # It is written into files, which is no place for a password.
+    if uri is not None and not re.fullmatch(r"https?://[^\s@?#]+", uri):
+        raise ConfigError(
+            f"{key}: should be null or a server's address, as in http://127.0.0.1:5000; user and password "
+            "belong into the environment, as MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD"
+        )
 
 
 def _check_env(env: EnvConfig) -> None:

@@ -105,7 +105,7 @@ def scene(
 
 
 def curves(groups: Mapping[str, tuple[str, Sequence[Sequence[tuple[float, float]]]]], x: str, y: str) -> bytes:
-    """A PNG of curves, each run's thin and the mean of each group thick where all its runs have a point.
+    """A PNG of curves, each run's thin and the mean of each group thick as far as all its runs go.
 
     groups: by name, the colour and each run's points.
     """
@@ -116,15 +116,23 @@ def curves(groups: Mapping[str, tuple[str, Sequence[Sequence[tuple[float, float]
     for name, (colour, runs) in groups.items():
         for run in runs:
             axes.plot(*np.reshape(run, (-1, 2)).T, color=colour, linewidth=0.8, alpha=0.5)
-        values = [dict(run) for run in runs]
-        shared = sorted(set.intersection(*(set(points) for points in values)))
-        means = [float(np.mean([points[at] for points in values])) for at in shared]
+        shared, means = _mean_curve([np.reshape(run, (-1, 2)).T for run in runs])
         axes.plot(shared, means, color=colour, linewidth=2.5, label=f"{name} ({len(runs)})")
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     axes.legend(frameon=False, fontsize=8)
     axes.spines[["top", "right"]].set_visible(False)
     return _png(figure)
+
+
+def _mean_curve(runs: Sequence[npt.NDArray[np.float64]]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """The mean of curves (x, y) where all of them are, at places of its own: theirs need not be the same."""
+    if not all(run.size for run in runs):
+        return np.empty(0), np.empty(0)
+    shared = np.linspace(max(run[0, 0] for run in runs), min(run[0, -1] for run in runs), 300)
+    if shared[-1] < shared[0]:
+        return np.empty(0), np.empty(0)
+    return shared, np.mean([np.interp(shared, *run) for run in runs], axis=0)
 
 
 def strips(groups: Mapping[str, tuple[str, Sequence[float]]], x: str) -> bytes:

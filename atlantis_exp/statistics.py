@@ -78,12 +78,16 @@ def resample(seeds: Sequence[Scores], resamples: int, rng: np.random.Generator) 
     """
     if not seeds:
         raise ValueError("a bootstrap needs at least one seed")
-    return [
-        np.concatenate(
-            [rng.choice(seeds[drawn], seeds[drawn].size) for drawn in rng.integers(len(seeds), size=len(seeds))]
-        )
-        for _ in range(resamples)
-    ]
+    pool = np.concatenate(seeds)
+    sizes = np.array([seed.size for seed in seeds])
+    starts = np.cumsum(sizes) - sizes
+
+    def drawn() -> Scores:
+        chosen = rng.integers(len(seeds), size=len(seeds))
+        size = sizes[chosen]
+        return pool[np.repeat(starts[chosen], size) + rng.integers(np.repeat(size, size))]
+
+    return [drawn() for _ in range(resamples)]
 
 
 def interval(estimates: Sequence[float] | Sequence[Scores] | Scores) -> npt.NDArray[np.float64]:

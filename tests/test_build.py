@@ -1,9 +1,17 @@
-"""What the composition root counts."""
+"""What the composition root counts, and which weights of a stored run it plays."""
 
+import shutil
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
-from atlantis_exp.build import count_update_flops
+import pytest
+import safetensors.torch
+
+from atlantis_exp.build import count_update_flops, stored_weights
+from atlantis_exp.commands.train import train
 from atlantis_exp.config import Config
+from atlantis_exp.faults import Fault
 
 
 def test_the_operations_of_an_update_are_those_counted_by_hand(tiny: Callable[..., Config]) -> None:
@@ -19,3 +27,22 @@ def test_the_operations_of_an_update_are_those_counted_by_hand(tiny: Callable[..
     assert count_update_flops(dqn) == 4 * (sample + forward)
     assert count_update_flops(double) == 4 * (sample + 2 * forward)
     assert 4 * 1.8e9 < count_update_flops(tiny("model=resnet", "env.size=159")) < 4 * 1.9e9
+
+
+@pytest.mark.slow
+def test_a_run_without_checkpoints_plays_from_the_weights_of_its_evaluations(tiny: Callable[..., Config]) -> None:
+    config = tiny()
+    train(config)
+    folder = Path(config.paths.outputs) / "runs" / config.run_name()
+
+    def stored(weights: str) -> tuple[dict[str, list[Any]], int]:
+        content, step = stored_weights(config, folder, weights)
+        return {name: tensor.tolist() for name, tensor in safetensors.torch.load(content).items()}, step
+
+    with_checkpoints = [stored("latest"), stored("best")]
+    shutil.rmtree(folder / "checkpoints")
+    assert [stored("latest"), stored("best")] == with_checkpoints
+    assert with_checkpoints[0][1] == 160
+    shutil.rmtree(folder)
+    with pytest.raises(Fault, match="neither a checkpoint nor an evaluation"):
+        stored("latest")

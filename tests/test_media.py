@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from atlantis_exp import media
 from atlantis_exp.media import BLUE, ORANGE, curves, film, run_colour, scene, score_heatmap, score_histogram, strips
 
 
@@ -127,3 +128,11 @@ def test_a_film_holds_every_screen_as_h264_that_browsers_play(mp4: bytes) -> Non
 def test_a_films_index_comes_before_its_pictures_so_that_a_browser_starts_at_once(mp4: bytes) -> None:
     boxes = top_level_boxes(mp4)
     assert boxes.index("moov") < boxes.index("mdat")
+
+
+def test_a_groups_mean_goes_as_far_as_all_its_runs_whatever_their_steps() -> None:
+    runs = [np.array([[0.0, 10.0, 30.0], [0.0, 10.0, 30.0]]), np.array([[5.0, 21.0], [15.0, 31.0]])]
+    steps, means = media._mean_curve(runs)
+    assert (steps[0], steps[-1]) == (5, 21)
+    np.testing.assert_allclose(means, steps + 5)
+    assert media._mean_curve([runs[0], np.empty((2, 0))])[0].size == 0

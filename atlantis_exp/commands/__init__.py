@@ -14,6 +14,7 @@ VERBS = {
     "query": "what the environment is, and what this config makes of it",
     "verify-resume": "proves, for any training, that killing and continuing it changes no bit",
     "report": "the results that the outputs folder holds, as a table",
+    "sync": "run folders into an MLflow store; to=URI to a server, from=URI from one, every=30s until interrupted",
     "ui": "the MLflow UI on the local store",
 }
 """Each verb and what it does, as `--help` lists them."""

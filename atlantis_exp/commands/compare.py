@@ -51,7 +51,7 @@ def compare(config: CompareConfig) -> None:
         "made": strftime("%Y-%m-%d %H:%M %Z"),
         "code": made.get("git.commit", made["version.atlantis-exp"]),
         "runs": f"{len(trainings)} under {outputs / 'runs'}",
-        "bootstrap": f"{config.resamples:,} samples, seed {config.seed}",
+        "bootstrap": f"{tables.fewer_samples(groups, config.resamples):,} samples, seed {config.seed}",
     }
     figures = draw(comparison)
     tags = {**labels(folder.name, run_colour("comparison")), "atlantis.kind": "comparison"}

@@ -19,7 +19,7 @@ from atlantis_exp.config import Config, ConfigError, TrackingConfig, flatten, ne
 from atlantis_exp.faults import Fault
 from atlantis_exp.media import score_histogram
 from atlantis_exp.tracking.journal import Commit, Journal, JournalError, Status, read_commit, write_file
-from atlantis_exp.tracking.store import Publisher, Store, unfinished
+from atlantis_exp.tracking.store import Publisher, Store, brought, unfinished
 from atlantis_exp.training.evaluation import Evaluation
 
 _DRAIN_SECONDS = 20.0  # that a command waits for MLflow at its end; `settle` sends what is missing then
@@ -63,12 +63,12 @@ class RunFolder:
     @property
     def config(self) -> dict[str, Any]:
         """The composed config, empty before the run's start."""
-        return _read(self.path / "config.json", dict[str, Any]) or {}
+        return _read(self.path / "config.json", _CONFIG) or {}
 
     @property
     def result(self) -> Result | None:
         """How the run ended, None before its end."""
-        return _read(self.path / "result.json", Result)
+        return _read(self.path / "result.json", _RESULT)
 
     @property
     def status(self) -> Status | None:
@@ -146,7 +146,8 @@ def settle(outputs: Path, continued: Path | None = None) -> None:
     for path in sorted(outputs.glob("*/*/commit.json")):
         folder = RunFolder(path.parent)
         try:
-            if folder.status == "RUNNING" and not folder.is_held:
+            runs_here = folder.status == "RUNNING" and not brought(folder.path)
+            if runs_here and not folder.is_held:
                 with suppress(Fault), folder.held():
                     Journal(folder.path).status("KILLED")
                     print(f"run {folder.name} was killed; the command that started it continues it")
@@ -285,8 +286,12 @@ def _locked(file: TextIO) -> bool:
     return True
 
 
-def _read(path: Path, schema: type[T]) -> T | None:
+def _read(path: Path, schema: TypeAdapter[T]) -> T | None:
     try:
-        return TypeAdapter(schema).validate_json(path.read_bytes(), strict=True) if path.exists() else None
+        return schema.validate_json(path.read_bytes(), strict=True) if path.exists() else None
     except ValidationError:
         raise Fault(f"{path} is damaged: remove it and issue the run's command again, which writes it anew") from None
+
+
+_RESULT = TypeAdapter(Result)
+_CONFIG = TypeAdapter(dict[str, Any])

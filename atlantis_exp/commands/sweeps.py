@@ -25,7 +25,7 @@ from atlantis_exp.config import Config, digest
 from atlantis_exp.faults import Fault
 from atlantis_exp.media import curves, strips
 from atlantis_exp.statistics import TABLE_COLUMNS
-from atlantis_exp.tracking.journal import Journal, JournalError, Metrics, Status, adopt, read, read_commit
+from atlantis_exp.tracking.journal import Journal, JournalError, Status, adopt, curve, read_commit
 from atlantis_exp.tracking.store import TRACEBACK
 
 _PAGE_SECONDS = 60.0  # between two looks at the runs while they are trained
@@ -326,6 +326,5 @@ def _evaluations(configs: Sequence[Config], folders: Sequence[RunFolder]) -> dic
 
 def _curve(folder: RunFolder, key: str) -> list[tuple[float, float]]:
     with suppress(ValueError, OSError):  # of a journal that was damaged: the run's own command says so
-        records = (record for _, record in read(folder.path) if isinstance(record, Metrics) and key in record.values)
-        return [(record.step, record.values[key]) for record in records]
+        return [(record.step, record.values[key]) for record in curve(folder.path, [key])]
     return []

@@ -119,6 +119,7 @@ def _defaults() -> dict[str, str]:
     return {group: option for entry in entries if isinstance(entry, dict) for group, option in entry.items()}
 
 
+@cache
 def _plain(path: Path) -> dict[str, Any]:
     tree = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
     assert isinstance(tree, dict)

@@ -274,19 +274,20 @@ def _train(
             progress.close()
             if trainer is not None:
                 trainer.emulators.close()
+        report = trainer.last_report or "no evaluation (evaluation.at_end=false)"
+        counts = {
+            "episodes": trainer.counters.episodes,
+            "frames": trainer.counters.frames,
+            "updates": trainer.learner.updates,
+            "hours": trainer.counters.seconds / 3600,
+        }
         journal.status("KILLED" if outcome == "interrupted" else "FINISHED")
+        if outcome != "interrupted":  # while it is still published: a server is sent the result, too
+            folder.write_result(Result(outcome, trainer.counters.steps, counts, trainer.last_metrics, report))
     if outcome == "interrupted":
         if not stop():
             return
         stop.leave(f"run {folder.name} is committed at step {trainer.counters.steps:,}; continue with: {command}")
-    report = trainer.last_report or "no evaluation (evaluation.at_end=false)"
-    counts = {
-        "episodes": trainer.counters.episodes,
-        "frames": trainer.counters.frames,
-        "updates": trainer.learner.updates,
-        "hours": trainer.counters.seconds / 3600,
-    }
-    folder.write_result(Result(outcome, trainer.counters.steps, counts, trainer.last_metrics, report))
     print(f"\n{report}\n\nrun {folder.name}: {trainer.counters.steps:,} steps, {trainer.counters.seconds:,.0f} s")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atlantis_exp.config import Config, ConfigError, flatten, nearest, parse, to_dict
-from atlantis_exp.tracking.journal import Metrics, Tags, read, read_commit
+from atlantis_exp.tracking.journal import Metrics, Tags, curve, read, read_commit
 
 Array = npt.NDArray[np.float64]
 
@@ -22,6 +22,15 @@ PROTOCOL = (
     *("env.crop", "evaluation.epsilon"),
 )
 """What must be equal for scores to mean the same; the observation's size belongs to the network."""
+
+_CURVE = {
+    "frames": "throughput/frames",
+    "hours": "throughput/hours",
+    "updates": "learning/updates",
+    "epsilon": "actions/epsilon",
+    "score": "score/mean_100",
+}
+_POINT = ("throughput/frames", "score/mean_100")  # what tells a point of the curve from other metrics
 
 _PLAYERS = ("agent", "player")  # the config's key of what has no network: a baseline, a person
 
@@ -188,23 +197,10 @@ def _config(folder: Path) -> dict[str, Any]:
 def _training(
     folder: Path, config: Config, evaluations: Sequence[tuple[int, dict[str, Any], Path]], epsilon: float | None
 ) -> Training:
-    curve: dict[str, list[float]] = defaultdict(list)
-    flops_per_update = None
-    for _, record in read(folder):
-        if isinstance(record, Tags):
-            flops_per_update = record.values.get("flops_per_update", flops_per_update)
-        elif isinstance(record, Metrics) and {"throughput/frames", "score/mean_100"} <= record.values.keys():
-            for name, metric in (
-                ("frames", "throughput/frames"),
-                ("hours", "throughput/hours"),
-                ("updates", "learning/updates"),
-                ("epsilon", "actions/epsilon"),
-                ("score", "score/mean_100"),
-            ):
-                curve[name].append(record.values[metric])
-    arrays = {name: np.array(values) for name, values in curve.items()}
-    if (updates := arrays.pop("updates", None)) is not None and flops_per_update is not None:
-        arrays["flops"] = updates * float(flops_per_update)
+    points = np.array([[record.values[key] for key in _CURVE.values()] for record in curve(folder, _POINT)])
+    arrays = dict(zip(_CURVE, points.T, strict=True)) if len(points) else {}
+    if (updates := arrays.pop("updates", None)) is not None and (flops := _flops_per_update(folder)) is not None:
+        arrays["flops"] = updates * flops
 
     steps = json.loads((folder / "result.json").read_bytes())["steps"]
     tables = [(config.evaluation.epsilon, folder / f"artifacts/evaluation/{steps:09d}.csv")]
@@ -222,6 +218,15 @@ def _training(
     science["phase"] = {str(index): phase for index, phase in enumerate(science["phase"])}
     leaves = flatten(to_dict(config)) | {"evaluation.epsilon": taken}
     return Training(folder.name, leaves, flatten(science), arrays, _episodes(path))
+
+
+def _flops_per_update(folder: Path) -> float | None:
+    for _, record in read(folder):
+        if isinstance(record, Tags) and "flops_per_update" in record.values:
+            return float(record.values["flops_per_update"])
+        if isinstance(record, Metrics):  # it is said before the first
+            break
+    return None
 
 
 def _evaluations(outputs: Path) -> dict[str, list[tuple[int, dict[str, Any], Path]]]:

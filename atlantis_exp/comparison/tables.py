@@ -35,6 +35,8 @@ AXES = {"frames": "equal frames", "hours": "equal hours", "flops": "equal gradie
 """The three fair views: column of a learning curve to what is equal."""
 
 _GRID = 100  # points of a curve
+_MOST_DRAWN = 40_000_000  # scores in all bootstrap samples together: 320 MB
+_FEWEST_SAMPLES = 200
 _HELD = 2_000.0  # what any one action scores when it is held
 
 
@@ -50,8 +52,12 @@ class Comparison:
 
 
 def compare(gathered: Gathered, groups: Groups, by: Sequence[str], resamples: int, seed: int) -> Comparison:
-    """Compare groups of trainings; intervals are 95 % bootstrap intervals of `resamples` samples drawn from `seed`."""
+    """Compare groups of trainings; intervals are 95 % bootstrap intervals of `resamples` samples drawn from `seed`.
+
+    Of very many episodes there are fewer, see `fewer_samples`.
+    """
     rng = np.random.default_rng(seed)
+    resamples = fewer_samples(groups, resamples)
     samples = {
         label: resample([training.episodes.scores for training in runs], resamples, rng)
         for label, runs in groups.items()
@@ -76,6 +82,12 @@ def compare(gathered: Gathered, groups: Groups, by: Sequence[str], resamples: in
     }
     notes = _notes(groups, by, views, evaluation, random_line(tables["references"]), frames)
     return Comparison(list(groups), list(by), _verdict(views, groups), notes, tables)
+
+
+def fewer_samples(groups: Groups, resamples: int) -> int:
+    """As many bootstrap samples as are asked for, but of very many episodes fewer, so that all fit into memory."""
+    episodes = sum(training.episodes.scores.size for runs in groups.values() for training in runs)
+    return min(resamples, max(_FEWEST_SAMPLES, _MOST_DRAWN // episodes))
 
 
 def to_csv(table: Table) -> str:
@@ -173,8 +185,8 @@ def _curve(axis: str, label: str, runs: Sequence[Training], rng: np.random.Gener
     grid = np.linspace(first, last, _GRID)
     scores = np.array([_at(training, axis, grid) for training in runs])
     epsilons = np.mean([_at(training, axis, grid, "epsilon") for training in runs], axis=0)
-    drawn = rng.integers(len(runs), size=(2_000, len(runs)))
-    low, high = interval(scores[drawn].mean(axis=1))
+    drawn = rng.multinomial(len(runs), np.full(len(runs), 1 / len(runs)), size=2_000)  # how often each run is
+    low, high = interval(drawn @ scores / len(runs))
     return [
         {"axis": axis, "group": label, "x": x, "score": score, "low": under, "high": over, "epsilon": epsilon}
         for x, score, under, over, epsilon in np.stack(

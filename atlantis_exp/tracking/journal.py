@@ -9,7 +9,7 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import Any, Literal, Protocol, get_args
 from uuid import uuid4
 
 from pydantic import TypeAdapter, ValidationError
+from pydantic_core import from_json
 
 Status = Literal["SCHEDULED", "RUNNING", "FINISHED", "FAILED", "KILLED"]
 NOTE = "mlflow.note.content"
@@ -104,6 +105,7 @@ class JournalError(ValueError):
 
 
 _COMMIT = TypeAdapter(Commit)
+_POINT_BYTES = 2_000  # between two points of a curve that are worth reading; three lines of a journal, or so
 
 
 class Tracker(Protocol):
@@ -262,9 +264,22 @@ def read_commit(folder: Path) -> Commit | None:
     """
     path = folder / "commit.json"
     try:
-        return _COMMIT.validate_json(path.read_bytes(), strict=True) if path.exists() else None
-    except ValidationError:
+        return commit_of(path.read_bytes()) if path.exists() else None
+    except JournalError:
         raise JournalError(f"{path} is damaged: remove it and issue the run's command again") from None
+
+
+def commit_of(content: bytes) -> Commit:
+    """Returns the commit that the bytes of a `commit.json` say. Raises: JournalError."""
+    try:
+        return _COMMIT.validate_json(content, strict=True)
+    except ValidationError:
+        raise JournalError("this is no commit.json") from None
+
+
+def commit_bytes(commit: Commit) -> bytes:
+    """Returns the `commit.json` of a commit."""
+    return _encode(asdict(commit)).encode()
 
 
 def adopt(folder: Path, parent: Path) -> None:
@@ -275,7 +290,22 @@ def adopt(folder: Path, parent: Path) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     commit = read_commit(folder) or _unborn()
-    _write_commit(folder, replace(commit, parent=os.path.relpath(parent, folder)))
+    adopted = replace(commit, parent=os.path.relpath(parent, folder))
+    if adopted != commit:
+        _write_commit(folder, adopted)
+
+
+def restore(folder: Path, start: int, pieces: Iterable[bytes]) -> None:
+    """Continues a run folder's journal from an offset with bytes of another copy of it; `commit.json` makes them count.
+
+    The caller holds the folder, and what is committed in it ends at `start` or before.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / "journal.jsonl", "ab") as file:
+        file.truncate(start)
+        file.writelines(pieces)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def read(folder: Path, start: int = 0, end: int | None = None) -> Iterator[tuple[int, Record]]:
@@ -309,12 +339,60 @@ def read(folder: Path, start: int = 0, end: int | None = None) -> Iterator[tuple
             yield start, _KINDS[kind](**fields)
 
 
+def curve(folder: Path, keys: Sequence[str], points: int = 500) -> Iterator[Metrics]:
+    """Yields the committed metrics that hold all of some keys, of a long journal about `points` of them.
+
+    A journal of over 2,000 bytes a point is cut into as many stretches of equal length, and the first in each is taken;
+    the first and the last of all are always among them. So a history's length costs nothing.
+
+    Raises:
+        ValueError: as `read`.
+    """
+    commit = read_commit(folder)
+    end = commit.offset if commit else 0
+    if end <= points * _POINT_BYTES:
+        for _, record in read(folder):
+            if isinstance(record, Metrics) and record.values.keys() >= set(keys):
+                yield record
+        return
+    kind, wanted = b'{"kind":"metrics",', [f"{_encode(key)}:".encode() for key in keys]
+    with open(folder / "journal.jsonl", "rb", buffering=_POINT_BYTES) as file:
+
+        def found(start: int, end: int) -> Iterator[bytes]:
+            """The lines with the keys that begin between two offsets."""
+            file.seek(max(start - 1, 0))
+            position = start if start == 0 else start - 1 + len(file.readline())
+            while position < end:
+                line = file.readline()
+                if not line.endswith(b"\n"):
+                    raise ValueError(f"{file.name} ends at byte {position + len(line)}, before its commit")
+                position += len(line)
+                if line.startswith(kind) and all(key in line for key in wanted):
+                    yield line
+
+        last = 0
+        for stretch in range(points):
+            line = next(found(stretch * end // points, (stretch + 1) * end // points), None)
+            if line is not None:
+                last = file.tell()
+                yield _metrics(line)
+        *_, line = (None, *found(last, end))
+        if line is not None:
+            yield _metrics(line)
+
+
+def _metrics(line: bytes) -> Metrics:
+    fields = from_json(line)  # four times as fast as `json`
+    del fields["kind"]
+    return Metrics(**fields)
+
+
 def _unborn() -> Commit:
     return Commit(uuid4().hex, _now(), _now(), 0, "SCHEDULED")
 
 
 def _write_commit(folder: Path, commit: Commit) -> None:
-    write_file(folder / "commit.json", _encode(asdict(commit)).encode())
+    write_file(folder / "commit.json", commit_bytes(commit))
 
 
 def write_file(path: Path, content: bytes) -> None:

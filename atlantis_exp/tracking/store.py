@@ -5,6 +5,7 @@ step, time and value), files overwrite themselves by name, runs and models are l
 """
 
 import fcntl
+import gzip
 import json
 import logging
 import math
@@ -13,11 +14,13 @@ import shutil
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 from uuid import UUID, uuid5
 
@@ -31,6 +34,7 @@ from atlantis_exp.tracking.journal import (
     Model,
     Params,
     Tags,
+    commit_bytes,
     read,
     read_commit,
     write_file,
@@ -39,7 +43,8 @@ from atlantis_exp.tracking.views import experiment_tags
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-    from mlflow.entities import Metric
+    from mlflow.entities import LoggedModel, Metric
+    from mlflow.store.artifact.artifact_repo import ArtifactRepository
 
 _log = logging.getLogger(__name__)
 
@@ -48,6 +53,17 @@ _PARAM_LENGTH = 6_000  # characters that MLflow keeps
 _RUN_NAME = "mlflow.runName"
 TRACEBACK = "traceback.txt"
 """The file of a run folder that says at length why the run failed last."""
+_HOME = "published.json"
+
+ORIGIN = "origin.json"
+"""Where a folder that was brought from a server notes how far it is one with the run there."""
+BESIDE = ("config.json", "result.json", TRACEBACK)
+"""The small files that a run folder may hold beside its `commit.json`."""
+STANDING = "atlantis.standing"
+"""The tag of a run whose folder is on the server as of a commit: `standing` of its small files."""
+TRAVELS = "run_folder"
+"""Where a run's artifacts hold its folder's small files and, in `journal/`, the committed bytes of its journal."""
+CHUNK = 2**23  # bytes of a journal that travel in one file
 
 
 @dataclass(frozen=True)
@@ -65,6 +81,8 @@ class StoredRun:
 class Store:
     """One experiment of an MLflow database under `root`, a folder on a local disk, or of the server at `tracking_uri`.
 
+    A server is also sent the folders' own small files, of which they can be made again elsewhere (see `travel`).
+
     Constructing one does nothing: MLflow is imported (1-3 s) and its tables are made on first use, which any number of
     processes may come to at once.
     """
@@ -72,7 +90,7 @@ class Store:
     def __init__(self, root: Path, experiment: str = "atlantis", tracking_uri: str | None = None) -> None:
         self._root = root.resolve()
         self._experiment = experiment
-        self._is_local = tracking_uri is None
+        self.is_local = tracking_uri is None
         self.uri = tracking_uri or f"sqlite:///{self._root / 'mlflow.db'}"
 
     @property
@@ -107,6 +125,29 @@ class Store:
             ]
         return found
 
+    def models(self, run_id: str) -> "list[LoggedModel]":
+        """Returns the models of a run."""
+        found: list[LoggedModel] = []
+        token: str | None = None
+        while token != "":
+            same = f"source_run_id = '{run_id}'"
+            page = self.client.search_logged_models([self.experiment_id], same, page_token=token)
+            token = page.token or ""
+            found += page
+        return found
+
+    def files(self, location: str) -> "Files":
+        """Returns the files of a run or model, whose location the server names.
+
+        Raises:
+            ValueError: where they are not behind the server: it may not name a place on this machine.
+        """
+        from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
+
+        if not location.startswith("mlflow-artifacts:"):
+            raise ValueError(f"its files are in {location}; only a server with --serve-artifacts gives them out")
+        return Files(get_artifact_repository(location, tracking_uri=self.uri))
+
     def prepare(self) -> None:
         """Makes the experiment explain itself and seeds its shared views, see `views`."""
         for key, value in experiment_tags().items():
@@ -128,9 +169,8 @@ class Store:
 
     def delete_run(self, run_id: str) -> None:
         """Deletes a run and its models, which MLflow would keep."""
-        while models := self.client.search_logged_models([self.experiment_id], f"source_run_id = '{run_id}'"):
-            for model in models:
-                self.client.delete_logged_model(model.model_id)
+        for model in self.models(run_id):
+            self.client.delete_logged_model(model.model_id)
         self.client.delete_run(run_id)
 
     @cached_property
@@ -138,6 +178,8 @@ class Store:
         os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
         os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")  # the default holds a call for 246 s
         os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")  # seconds
+        os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
+        os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
         from mlflow import MlflowClient
 
         # Whatever fails in MLflow reaches us as an exception; its log would add a traceback to each.
@@ -145,7 +187,7 @@ class Store:
         logging.getLogger("alembic").setLevel(logging.WARNING)
         self._root.mkdir(parents=True, exist_ok=True)
         with _locked(self._root / "mlflow.lock"):  # processes that make the tables together break them for good
-            if self._is_local:
+            if self.is_local:
                 database_file = self._root / "mlflow.db"
                 if not database_file.exists():
                     # MLflow never recovers from a process that dies while it makes the tables: they are made aside.
@@ -161,19 +203,41 @@ class Store:
             if experiment := client.get_experiment_by_name(self._experiment):
                 return client, experiment.experiment_id
             # MLflow's own choice would depend on the working directory of whoever comes first.
-            location = (self._root / "artifacts" / self._experiment).as_uri() if self._is_local else None
-            return client, client.create_experiment(self._experiment, location)
+            location = (self._root / "artifacts" / self._experiment).as_uri() if self.is_local else None
+            try:
+                return client, client.create_experiment(self._experiment, location)
+            except Exception:
+                if experiment := client.get_experiment_by_name(self._experiment):
+                    return client, experiment.experiment_id  # another machine was faster
+                raise
+
+
+class Files:
+    """The files of a run or model on a server, by their paths."""
+
+    def __init__(self, repository: "ArtifactRepository") -> None:
+        self._repository = repository
+
+    def names(self, folder: str) -> set[str]:
+        """Returns the names of what lies in a folder, none where there is no such folder."""
+        return {os.path.basename(file.path) for file in self._repository.list_artifacts(folder)}
+
+    def read(self, path: str) -> bytes:
+        """Returns what a file holds."""
+        with TemporaryDirectory() as aside:
+            return Path(self._repository.download_artifacts(path, aside)).read_bytes()  # type: ignore[no-untyped-call]
 
 
 def unfinished(folder: Path, root: Path) -> Store | None:
     """Returns the store, with its files under `root`, that lacks a part of what a published folder has committed."""
-    cursor, commit = _Cursor.read(folder), read_commit(folder)
+    cursor, commit = Cursor.read(folder / _HOME), read_commit(folder)
     if cursor is None or commit is None:
         return None
-    if (cursor.identity, cursor.offset, cursor.standing) == (commit.identity, commit.offset, _standing(commit)):
+    is_server = cursor.store.startswith("http")
+    if cursor.standing == standing(small_files(folder, commit, is_server)):
         return None
     uri, _, experiment = cursor.store.rpartition("#")
-    return Store(root, experiment, uri if uri.startswith("http") else None)
+    return Store(root, experiment, uri if is_server else None)
 
 
 class Publisher:
@@ -226,27 +290,37 @@ class Publisher:
                 self._draining.wait(delay)
 
 
-def publish(folder: Path, store: Store) -> None:
-    """Brings the MLflow run of a folder up to the folder's last commit, unless the run has yet to start.
+def publish(folder: Path, store: Store, home: bool = True) -> bool:
+    """Brings the MLflow run of a folder up to the folder's last commit; returns whether it was behind.
+
+    A run that has yet to start is left alone.
 
     May be repeated, interrupted, and run by several processes at once without doubling anything. How far it came stands
     in `published.json`; without that file everything is sent again. Lines are sent in their order, so a step never runs
     backwards. Infinite values are left out (MLflow would show 1.8e308; the journal has them), NaN is kept. A file that
     is gone is passed over with a warning. A param that changes once MLflow has it, as final there, becomes a tag.
 
+    Args:
+        home: whether this becomes the store that `unfinished` asks for; False leaves that to the one that is, if any,
+            and notes in a file of its own how far it came.
+
     Raises:
         ValueError: on a damaged journal.
         MlflowException, OSError, sqlite3.Error: when MLflow cannot be reached; what is missing stays to be published.
     """
     folder = folder.resolve()
-    with _locked(folder / "published.lock"):
+    note = _note(folder, store, home)
+    with _locked(note.with_suffix(".lock")):
         commit = read_commit(folder)
         if commit is None or commit.status == "SCHEDULED":
-            return
-        cursor = _Cursor.of(folder, store, commit)
-        if (cursor.offset, cursor.standing) == (commit.offset, _standing(commit)):
-            return
+            return False
+        files = small_files(folder, commit, is_server=not store.is_local)
+        cursor = Cursor.of(note, folder, store, commit)
+        if cursor.standing == standing(files):
+            return False
         mirror = _Mirror(folder, store, cursor.run_id)
+        if not store.is_local:
+            mirror.send_journal(cursor.offset, commit.offset)
         points: list[Metric] = []
         for offset, record in read(folder, cursor.offset, commit.offset):
             if isinstance(record, Metrics):
@@ -258,30 +332,58 @@ def publish(folder: Path, store: Store) -> None:
             if not isinstance(record, Metrics):
                 mirror.send(record)
             cursor = replace(cursor, offset=offset)
-            cursor.save(folder)
-        mirror.send_standing(commit, _parent_run(folder, store, commit))
-        replace(cursor, standing=_standing(commit)).save(folder)
+            cursor.save(note)
+        mirror.send_standing(commit, _parent_run(folder, store, commit, home))
+        if not store.is_local:
+            mirror.send_small_files(files)
+        replace(cursor, standing=standing(files)).save(note)
+        return True
 
 
-def _standing(commit: Commit) -> str:
-    """What a commit says beside the journal, to be compared."""
-    return json.dumps([commit.status, commit.error, commit.labels, commit.parent])
+def _note(folder: Path, store: Store, home: bool) -> Path:
+    """The file that says how far a folder is published in a store."""
+    if (origin := brought(folder)) is not None and origin.store == store.address:
+        return folder / ORIGIN
+    at_home = Cursor.read(folder / _HOME)
+    if home or at_home is None or at_home.store == store.address:
+        return folder / _HOME
+    return folder / f"published-{sha256(store.address.encode()).hexdigest()[:8]}.json"
 
 
-def _parent_run(folder: Path, store: Store, commit: Commit) -> str | None:
+def small_files(folder: Path, commit: Commit, is_server: bool = True) -> dict[str, bytes]:
+    """Returns the files that say, beside its journal, what a run is and how it stands: their content by their names.
+
+    A local store is beside the folder and needs none but the commit.
+    """
+    names = [name for name in BESIDE if is_server and (folder / name).exists()]
+    return {"commit.json": commit_bytes(commit), **{name: (folder / name).read_bytes() for name in names}}
+
+
+def standing(files: Mapping[str, bytes]) -> str:
+    """Returns a hash of small files, to be compared."""
+    return sha256(json.dumps({name: sha256(files[name]).hexdigest() for name in sorted(files)}).encode()).hexdigest()
+
+
+def brought(folder: Path) -> "Cursor | None":
+    """Returns whence a folder was brought, if it still is the run that was; that one is another folder's to change."""
+    origin, commit = Cursor.read(folder / ORIGIN), read_commit(folder)
+    return origin if origin and commit and origin.identity == commit.identity else None
+
+
+def _parent_run(folder: Path, store: Store, commit: Commit, home: bool) -> str | None:
     """The run that a folder's is shown under, which is published if it is not yet there."""
     if not commit.parent:
         return None
     parent = (folder / commit.parent).resolve()
     if not parent.exists():
         return None
-    publish(parent, store)
-    cursor = _Cursor.read(parent)
+    publish(parent, store, home)
+    cursor = Cursor.read(_note(parent, store, home))
     return cursor.run_id if cursor else None
 
 
 @dataclass(frozen=True)
-class _Cursor:
+class Cursor:
     """How far a folder is published, where to, and as which run."""
 
     store: str
@@ -291,35 +393,39 @@ class _Cursor:
     standing: str = ""
 
     @classmethod
-    def of(cls, folder: Path, store: Store, commit: Commit) -> "_Cursor":
+    def of(cls, note: Path, folder: Path, store: Store, commit: Commit) -> "Cursor":
         """Returns the folder's cursor in this store, at the start of a found or new run if there is none."""
-        cursor = cls.read(folder)
+        cursor = cls.read(note)
         if cursor is None or (cursor.store, cursor.identity) != (store.address, commit.identity):
             if cursor is not None and cursor.store == store.address and cursor.run_id:
                 store.delete_run(cursor.run_id)  # it shows lines that the journal has taken back
             cursor = cls(store.address, commit.identity)
-            cursor.save(folder)  # should MLflow be out of reach, `unfinished` tells others where it is to go
+            cursor.save(note)  # should MLflow be out of reach, `unfinished` tells others where it is to go
         if not cursor.run_id:
             cursor = replace(cursor, run_id=store.open_run(folder, commit))
-            cursor.save(folder)
+            cursor.save(note)
         return cursor
 
     @classmethod
-    def read(cls, folder: Path) -> "_Cursor | None":
-        """Returns what was noted in a folder; None also where that is damaged, since sending all again is harmless."""
+    def read(cls, note: Path) -> "Cursor | None":
+        """Returns what was noted; None also where that is damaged, since sending all again is harmless."""
         try:
-            return TypeAdapter(cls).validate_json((folder / "published.json").read_bytes(), strict=True)
+            return _CURSOR.validate_json(note.read_bytes(), strict=True)
         except (FileNotFoundError, ValidationError):
             return None
 
-    def save(self, folder: Path) -> None:
-        write_file(folder / "published.json", json.dumps(asdict(self)).encode())
+    def save(self, note: Path) -> None:
+        write_file(note, json.dumps(asdict(self)).encode())
+
+
+_CURSOR = TypeAdapter(Cursor)
 
 
 class _Mirror:
     """Sends records of one folder to one run; every method may be repeated."""
 
     def __init__(self, folder: Path, store: Store, run_id: str) -> None:
+        self._journal = folder / "journal.jsonl"
         self._artifacts = folder / "artifacts"
         self._traceback = folder / TRACEBACK
         self._client = store.client
@@ -346,6 +452,30 @@ class _Mirror:
 
     def send_points(self, points: "list[Metric]") -> None:
         self._client.log_batch(self._run_id, metrics=points, synchronous=True)
+
+    def send_journal(self, start: int, end: int) -> None:
+        """Sends committed bytes as they are; a file is named by where it begins, and may be sent again with more."""
+        if start == end:
+            return
+        with open(self._journal, "rb") as file:
+            file.seek(start)
+            while start < end:
+                content = file.read(min(CHUNK, end - start))
+                if not content:
+                    raise ValueError(f"{file.name} ends at byte {start}, before its commit at {end}")
+                self._send_file(f"{TRAVELS}/journal/{start:012d}.gz", gzip.compress(content, mtime=0))
+                start += len(content)
+
+    def send_small_files(self, files: Mapping[str, bytes]) -> None:
+        for name, content in files.items():
+            self._send_file(f"{TRAVELS}/{name}", content)
+        self._send_tags({STANDING: standing(files)})  # last: who finds it finds all of them
+
+    def _send_file(self, path: str, content: bytes) -> None:
+        with TemporaryDirectory() as aside:
+            file = Path(aside, os.path.basename(path))
+            file.write_bytes(content)
+            self._client.log_artifact(self._run_id, str(file), os.path.dirname(path))
 
     def send_standing(self, commit: Commit, parent_run: str | None) -> None:
         if commit.status == "RUNNING":
@@ -397,10 +527,9 @@ class _Mirror:
         from mlflow.tracking.multimedia import compress_image_size
         from PIL.Image import open as open_image
 
-        unique = uuid5(UUID(self._run_id), record.path)
-        name = f"images/{record.key.replace('/', '~')}+step+{record.step}+timestamp+{record.time}+{unique}"
+        name = image_name(self._run_id, record)
+        self._send_file(f"{name}.png", (self._artifacts / record.path).read_bytes())
         with open_image(self._artifacts / record.path) as image:
-            self._client.log_image(self._run_id, image, f"{name}.png")
             self._client.log_image(self._run_id, compress_image_size(image), f"{name}+compressed.webp")
         self._send_tags({"mlflow.loggedImages": "True"})
 
@@ -424,6 +553,12 @@ class _Mirror:
                 if model.model_id != model_id:
                     self._client.delete_logged_model_tag(model.model_id, "best")
             self._client.set_logged_model_tags(model_id, {"best": "true"})
+
+
+def image_name(run_id: str, record: Image) -> str:
+    """Returns the path of an image among its run's artifacts, without its ending, as MLflow's pages look for it."""
+    unique = uuid5(UUID(run_id), record.path)
+    return f"images/{record.key.replace('/', '~')}+step+{record.step}+timestamp+{record.time}+{unique}"
 
 
 @contextmanager

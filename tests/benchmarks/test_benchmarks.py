@@ -4,12 +4,13 @@ import itertools
 import json
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from atlantis_exp.build import count_update_flops
-from benchmarks import emulation, learner, overhead, replay, training
+from benchmarks import emulation, learner, overhead, replay, store, training
 from benchmarks.contest import paired_ratio, ratio, take_turns
 
 Main = Callable[[Sequence[str]], None]
@@ -98,3 +99,15 @@ def test_the_flops_of_an_update_are_those_of_its_layers() -> None:
 def test_overhead_tells_the_share_of_tracking(capsys: pytest.CaptureFixture[str]) -> None:
     results = results_of(overhead.main, "--rounds 1 --seconds 1 --commit-seconds 0.5", capsys)
     assert 0 < results["tracking_share"] < 1
+
+
+@pytest.mark.slow
+def test_store_measures_every_command_over_many_runs(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    results = results_of(store.main, "--runs 4 --episodes 20 --distinct 2", capsys)
+    for command in ("compare", "sweep", "report", "sync"):
+        assert results[f"{command}_s"] > 0, command
+        assert results[f"{command}_mib"] > 0, command
+    assert not list(tmp_path.iterdir())

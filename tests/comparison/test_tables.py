@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from atlantis_exp.comparison import tables
 from atlantis_exp.comparison.gather import gather, group
 from atlantis_exp.comparison.tables import Comparison, compare, early_dqn, published, to_csv
 
@@ -49,6 +50,18 @@ def test_the_evaluation_of_a_group_is_that_of_all_its_episodes(compared: Callabl
         for statistic in ("iqm", "mean", "median"):
             assert row[f"{statistic}_low"] <= row[statistic] <= row[f"{statistic}_high"]
             assert row[f"{statistic}_low"] < row[f"{statistic}_high"]
+
+
+def test_of_very_many_episodes_fewer_bootstrap_samples_are_drawn(
+    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded(scores=GOOD[0])
+    groups = group(gather(tmp_path).trainings, ["model"])
+    assert tables.fewer_samples(groups, 2_000) == 2_000
+    monkeypatch.setattr(tables, "_MOST_DRAWN", 4 * 300)
+    assert (tables.fewer_samples(groups, 2_000), tables.fewer_samples(groups, 100)) == (300, 100)
+    monkeypatch.setattr(tables, "_MOST_DRAWN", 4)
+    assert tables.fewer_samples(groups, 2_000) == 200
 
 
 def test_the_verdict_is_the_difference_of_the_runs_iqms_with_welchs_interval(

@@ -9,6 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -25,6 +26,7 @@ from atlantis_exp.tracking.journal import (
     Tags,
     Tracker,
     adopt,
+    curve,
     read,
     read_commit,
     write_file,
@@ -403,3 +405,30 @@ def test_the_null_journal_accepts_everything_and_remembers_nothing() -> None:
     null.metrics({"?": math.inf}, -1)
     null.load_state_dict(null.state_dict())
     assert vars(null) == {}
+
+
+def test_the_curve_of_a_long_journal_is_some_of_its_points_with_both_ends(tmp_path: Path) -> None:
+    journal = Journal(tmp_path)
+    journal.tags({"note": '"score/mean":1 "frames":1'})
+    for step in range(2_000):
+        journal.metrics({"score/episode": step}, step)
+        if 10 <= step < 1_900:
+            journal.metrics({"score/mean": step / 2, "frames": step}, step)
+    journal.state_dict()
+    journal.commit()
+    journal.metrics({"score/mean": 0.0, "frames": 0}, 2_000)
+    journal.state_dict()
+    whole = [record for _, record in read(tmp_path) if isinstance(record, Metrics) and "frames" in record.values]
+    assert list(curve(tmp_path, ["frames", "score/mean"])) == whole
+    for points in (1, 7, 50):
+        some = list(curve(tmp_path, ["frames", "score/mean"], points))
+        assert 0.9 * points <= len(some) <= points + 1
+        assert (some[0], some[-1]) == (whole[0], whole[-1])
+        steps = [record.step for record in some]
+        assert steps == sorted(set(steps))
+        assert max(np.diff(steps)) < 2.5 * 2_000 / points
+        assert set(map(repr, some)) <= set(map(repr, whole))
+    assert list(curve(tmp_path, ["missing"], 7)) == []
+    (tmp_path / "journal.jsonl").write_bytes(b"{}")
+    with pytest.raises(ValueError, match="before its commit"):
+        list(curve(tmp_path, ["frames"], 7))

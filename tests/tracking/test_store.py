@@ -196,13 +196,13 @@ def test_a_process_killed_between_sending_and_noting_it_doubles_nothing(
 import os, signal
 from pathlib import Path
 from atlantis_exp.tracking import store
-save, calls = store._Cursor.save, []
+save, calls = store.Cursor.save, []
 def save_or_die(cursor, folder):
     calls.append(cursor)
     if len(calls) == 5:
         os.kill(os.getpid(), signal.SIGKILL)
     save(cursor, folder)
-store._Cursor.save = save_or_die
+store.Cursor.save = save_or_die
 store.publish(Path({str(tmp_path)!r}), store.Store(Path({str(root)!r})))
 """
     process = subprocess.run([sys.executable, "-c", killed], cwd=REPOSITORY, check=False)
@@ -268,8 +268,8 @@ def test_points_of_one_millisecond_survive_a_break_between_their_batches(
             raise OSError("no space")
         save(cursor, folder)
 
-    save = store_module._Cursor.save
-    monkeypatch.setattr(store_module._Cursor, "save", save_once)
+    save = store_module.Cursor.save
+    monkeypatch.setattr(store_module.Cursor, "save", save_once)
     with pytest.raises(OSError, match="no space"):
         publish(tmp_path, store)
     assert 0 < len(points(root, tmp_path)) < 1_000

@@ -1,0 +1,168 @@
+"""The way back from a server: MLflow runs enter, the run folders that they were published from leave, byte for byte.
+
+A folder's small files and the committed bytes of its journal travel as artifacts (see `store`), and each record of the
+journal names its own file. What a server says is data: places are checked, and small files count if their hash fits.
+"""
+
+import gzip
+import io
+import logging
+import os
+import re
+from collections.abc import Collection, Iterator, Mapping
+from math import inf
+from pathlib import Path
+from typing import Literal
+
+from atlantis_exp.tracking.journal import (
+    Artifact,
+    Image,
+    Model,
+    commit_of,
+    read,
+    read_commit,
+    restore,
+    write_file,
+)
+from atlantis_exp.tracking.store import (
+    BESIDE,
+    CHUNK,
+    ORIGIN,
+    STANDING,
+    TRAVELS,
+    Cursor,
+    Files,
+    Store,
+    StoredRun,
+    brought,
+    image_name,
+    small_files,
+    standing,
+)
+
+_log = logging.getLogger(__name__)
+
+_PLACE = r"([a-z]+)/[A-Za-z0-9][A-Za-z0-9_.,~+=@-]{0,199}"
+_JOURNAL = f"{TRAVELS}/journal"
+
+Outcome = Literal["brought", "ahead", "other", "growing"]
+"""What became of a run: it is here now, further along here, has another's place, or has not all arrived yet."""
+
+
+def place(run: StoredRun, outputs: Path) -> Path:
+    """Returns the folder under `outputs` that a run belongs into. Raises: ValueError."""
+    named = "/".join(run.folder.parts[-2:])
+    parts = re.fullmatch(_PLACE, named)
+    if parts is None or parts[1] == "artifacts":  # which is MLflow's
+        raise ValueError(f"it comes from {str(run.folder)!r}, which is no run folder's place")
+    return outputs / named
+
+
+def is_here(folder: Path, run: StoredRun) -> bool:
+    """Whether a folder stands exactly as a run on a server does. Raises: JournalError."""
+    commit = read_commit(folder)
+    return commit is not None and standing(small_files(folder, commit)) == run.tags.get(STANDING)
+
+
+def bring(run: StoredRun, folder: Path, store: Store, listed: Collection[str]) -> Outcome:
+    """Brings a run of a server into its folder, which the caller holds, or what of it is new there.
+
+    A folder that is further along stays as it is, and so does one of another run; one that was brought from a run that
+    the server has replaced since, and was not touched here, is replaced, too. Files that the server lacks are passed
+    over with a warning. Interrupted at any moment, it leaves what was there and is made good by the next attempt.
+
+    Args:
+        listed: the ids of all runs that the server has now.
+
+    Raises:
+        ValueError: on what cannot be a run folder's; the folder stays as it was.
+        MlflowException, OSError: when the server cannot be reached.
+    """
+    client = store.client
+    files = store.files(client.get_run(run.run_id).info.artifact_uri)
+    names = files.names(TRAVELS)
+    small = {name: files.read(f"{TRAVELS}/{name}") for name in ("commit.json", *BESIDE) if name in names}
+    if standing(small) != run.tags.get(STANDING):
+        return "growing"
+    commit = commit_of(small["commit.json"])
+    _check_parent(folder, commit.parent)
+    start = 0
+    if (local := read_commit(folder)) is not None:
+        here, origin = standing(small_files(folder, local)), brought(folder)
+        untouched = origin is not None and (origin.store, origin.standing) == (store.address, here)
+        if local.identity == commit.identity:
+            is_newer = untouched or (commit.offset, commit.updated) > (local.offset, local.updated)
+            if commit.offset < local.offset or not is_newer:
+                return "ahead"
+            start = local.offset
+        elif untouched and origin is not None and origin.run_id not in listed:
+            (folder / "commit.json").unlink()  # readers first: the journal changes under them next
+        else:
+            return "other"
+    elif (folder / "journal.jsonl").exists() and not (folder / ORIGIN).exists():
+        return "other"  # it has lost its commit.json
+    Cursor(store.address, commit.identity, run.run_id, commit.offset, standing(small)).save(folder / ORIGIN)
+    restore(folder, start, _journal(files, start, commit.offset))
+    records = (record for _, record in read(folder, start, commit.offset))
+    named = {record.path: record for record in records if isinstance(record, Artifact | Image | Model)}
+    _bring_files(run, folder, store, files, named)
+    for name in BESIDE:
+        if name in small:
+            write_file(folder / name, small[name])
+        else:
+            (folder / name).unlink(missing_ok=True)
+    write_file(folder / "commit.json", small["commit.json"])
+    return "brought"
+
+
+def _check_parent(folder: Path, parent: str) -> None:
+    """Refuse a parent that is no run folder's place, or that is shown under the folder itself."""
+    place = folder = Path(os.path.normpath(folder))
+    while parent:
+        if not re.fullmatch(rf"\.\./\.\./{_PLACE}", parent):
+            raise ValueError(f"its parent {parent!r} is no run folder's place")
+        place = Path(os.path.normpath(place / parent))
+        if place == folder:
+            raise ValueError("it is its own parent")
+        commit = read_commit(place)
+        parent = commit.parent if commit else ""
+
+
+def _journal(files: Files, start: int, end: int) -> Iterator[bytes]:
+    """The bytes of a journal between two offsets; the server's pieces may overlap, since they may be sent again."""
+    named = (re.fullmatch(r"(\d{12})\.gz", name) for name in files.names(_JOURNAL))
+    begins = sorted(int(name[1]) for name in named if name)
+    for begin, following in zip(begins, [*begins[1:], inf], strict=True):
+        if start >= end or begin > start:
+            break
+        if following <= start:
+            continue
+        with gzip.GzipFile(fileobj=io.BytesIO(files.read(f"{_JOURNAL}/{begin:012d}.gz"))) as packed:
+            piece = packed.read(CHUNK)[start - begin : end - begin]
+        yield piece
+        start += len(piece)
+    if start < end:
+        raise ValueError(f"the server lacks its journal from byte {start} on")
+
+
+def _bring_files(
+    run: StoredRun, folder: Path, store: Store, files: Files, named: Mapping[str, Artifact | Image | Model]
+) -> None:
+    """Write the files that records name, by path."""
+    has_models = any(isinstance(record, Model) for record in named.values())
+    models = {(model.name, model.tags.get("step")): model for model in store.models(run.run_id)} if has_models else {}
+    listed: dict[str, set[str]] = {}  # folders, and what lies in them
+    for path, record in named.items():
+        if isinstance(record, Model):
+            model = models.get((record.name, str(record.step)))
+            content = store.files(model.artifact_location).read(os.path.basename(path)) if model else None
+        else:
+            there = f"{image_name(run.run_id, record)}.png" if isinstance(record, Image) else path
+            above, name = os.path.split(there)
+            if above not in listed:
+                listed[above] = files.names(above)
+            content = files.read(there) if name in listed[above] else None
+        if content is None:
+            _log.warning("%s is not on the server and cannot be brought", folder / "artifacts" / path)
+        else:
+            write_file(folder / "artifacts" / path, content)
