@@ -126,8 +126,8 @@ def test_the_address_opens_on_charts_of_every_run_and_pictures_with_a_slider(pag
 
 
 def test_the_sweep_view_has_a_curve_a_group(page: Any, address: str) -> None:
+    page.goto("about:blank")  # else only the part behind '#' changes, and the application begins with the old view
     page.goto(address.replace("=start", "=sweep"))
-    page.reload()
     page.get_by_text("Group: cnn uniform quick").first.wait_for()
     page.locator(".js-plotly-plot .scatterlayer .trace").first.wait_for()
     assert page.get_by_text("cnn uniform quick").count() > 1  # the legends' as well
