@@ -4,19 +4,18 @@ import dataclasses
 import os
 import shlex
 import signal
-import subprocess
 import sys
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from math import inf
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from atlantis_exp.commands.app import JOB_OF, job_of, launcher, run_verb, swept
+from atlantis_exp.commands.app import job_of, launcher, run_verb, swept
 from atlantis_exp.config import Config, ConfigError, flatten, to_dict
 from atlantis_exp.faults import Fault
 
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from atlantis_exp.training.trainer import Trainer
 
 _LOOK_SECONDS = 1.0  # between two looks at whether the sweep goes on
-_OUTPUT = "output.txt"  # what a run in a process of its own printed
 
 
 class StopRequest:
@@ -107,7 +105,7 @@ def train(config: Config, watch: "Callable[[Trainer], bool]" = lambda _: False) 
     folder = RunFolder(outputs / "runs" / config.run_name())
     if job_of() is None:
         settle(outputs, folder.path if folder.result is None else None)
-    sweep_goes_on = _watch_of(folder)
+    sweep_goes_on = watch_of(folder)
     if not sweep_goes_on():
         raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
     if config.resume == "must" and not folder.has_started:
@@ -122,7 +120,7 @@ def train(config: Config, watch: "Callable[[Trainer], bool]" = lambda _: False) 
         if parent is not None:
             adopt(folder.path, parent)
         print(f"the run that was here is kept as {kept}")
-    if (result := _final_result(config, folder)) is not None:
+    if (result := final_result(config, folder)) is not None:
         print(f"run {folder.name} has ended ({result.outcome} after {result.steps:,} steps):\n")
         print(result.report)
         return
@@ -130,74 +128,7 @@ def train(config: Config, watch: "Callable[[Trainer], bool]" = lambda _: False) 
         _train(config, folder, sweep_goes_on, watch)
 
 
-def train_job(config: Config) -> None:
-    """Train here, or, as a job of joblib's, in a process of its own: whatever ends it, the other jobs go on.
-
-    Raises:
-        Fault: where the run fails; as the one line that a launcher can carry from machine to machine.
-    """
-    if job_of() is None:
-        train(config)
-    elif job_of() == "joblib":
-        _train_apart(config)
-    else:
-        try:
-            with _kept_output(config) if job_of() == "ray" else nullcontext():
-                train(config)
-        except (ConfigError, Fault, OSError):
-            raise
-        except Exception as error:
-            traceback.print_exc()
-            raise Fault(f"run {config.run_name()}: {type(error).__name__}: {error}") from error
-
-
-@contextmanager
-def _kept_output(config: Config) -> "Iterator[None]":
-    """What is printed goes to the run's folder, since Ray's own files of it are on whatever machine this is."""
-    folder = Path(config.paths.outputs) / "runs" / config.run_name()
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / _OUTPUT, "a", buffering=1) as output, redirect_stdout(output), redirect_stderr(output):
-        yield
-
-
-def _train_apart(config: Config) -> None:
-    from atlantis_exp.commands.runs import RunFolder
-    from atlantis_exp.tracking.journal import Journal, JournalError
-
-    folder = RunFolder(Path(config.paths.outputs) / "runs" / config.run_name())
-    if config.resume != "never" and _final_result(config, folder) is not None:
-        return
-    if not _watch_of(folder)():
-        raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
-    folder.path.mkdir(parents=True, exist_ok=True)
-    with open(folder.path / _OUTPUT, "a+") as output:
-        start = output.tell()
-        code = subprocess.run(
-            [sys.executable, "-m", "atlantis_exp", "train", *sys.argv[1:]],
-            env={**os.environ, JOB_OF: "apart"},
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=output,
-            check=False,
-        ).returncode
-        if folder.parent and not RunFolder(folder.parent).is_held:
-            os._exit(code)  # the process that this worker works for was killed: there is nobody to tell
-        output.seek(start)
-        said = output.read().splitlines()
-    if code == 0:
-        return
-    reason = (
-        f"killed by {signal.Signals(-code).name}"
-        if code < 0
-        else (said or ["it said nothing"])[-1].removeprefix("atlantis_exp: ")
-    )
-    if code < 0 or (code == 1 and folder.state != "failed"):  # it could not say so itself
-        with suppress(Fault, JournalError), folder.held():
-            Journal(folder.path).status("KILLED" if code < 0 else "FAILED", reason)
-    raise Fault(f"run {folder.name}: {reason}; see {folder.path / _OUTPUT}", exit_code=code if code > 0 else 128 - code)
-
-
-def _final_result(config: Config, folder: "RunFolder") -> "Result | None":
+def final_result(config: Config, folder: "RunFolder") -> "Result | None":
     """How the run has ended, None if it goes on: it has not, or it did by its budget and has now a larger one."""
     if not folder.has_started or (result := folder.result) is None:
         return None
@@ -205,7 +136,7 @@ def _final_result(config: Config, folder: "RunFolder") -> "Result | None":
     return None if result.outcome == "budget" and (budget is None or budget > result.steps) else result
 
 
-def _watch_of(folder: "RunFolder") -> Callable[[], bool]:
+def watch_of(folder: "RunFolder") -> Callable[[], bool]:
     """What tells whether the process that launched this job still wants it; Slurm's jobs do without that process."""
     name, parent = job_of(), folder.parent
     if parent is None or name not in ("joblib", "apart", "ray"):
@@ -322,4 +253,6 @@ def sweep_ledger(configs: Sequence[Config]) -> AbstractContextManager[None]:
 
 def main() -> None:
     """Compose and train."""
+    from atlantis_exp.commands.jobs import train_job
+
     run_verb("config", Config, train_job, sweep_ledger)

@@ -265,6 +265,7 @@ class Publisher:
 
     def _run(self) -> None:
         delay, failing = self._interval, False
+        self._draining.wait(delay)  # MLflow's import would slow down whatever starts now, and what is measured then
         while True:
             draining = self._draining.is_set()  # asked first: what is committed before a drain is published by it
             error: Exception | None = None

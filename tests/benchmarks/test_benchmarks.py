@@ -41,6 +41,7 @@ def test_a_ratio_with_one_side_left_out_is_none() -> None:
     assert paired_ratio(None, [1.0]) is None
 
 
+@pytest.mark.slow
 def test_training_leaves_out_what_it_was_not_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
     results = results_of(training.main, "--contestants ours_1 --num-envs --fills --rounds 1 --seconds 0.1", capsys)
     assert {"vs_sb3_16", "vs_sb3_1", "vs_report", "vs_sb3_16_fp32"} <= results.keys()
@@ -61,12 +62,14 @@ def test_training_measures_every_contestant(capsys: pytest.CaptureFixture[str]) 
 
 
 @needs_envpool
+@pytest.mark.slow
 def test_emulation_measures_every_contestant(capsys: pytest.CaptureFixture[str]) -> None:
     results = results_of(emulation.main, "--num-envs 2 --rounds 1 --seconds 0.1", capsys)
     for key in ("vs_atari_vector", "vs_envpool", "vs_raw"):
         assert results[key] > 0, key
 
 
+@pytest.mark.slow
 def test_replay_measures_memory_and_sampling(capsys: pytest.CaptureFixture[str]) -> None:
     results = results_of(replay.main, "--cases 84 --steps 200 --transitions 400 --rounds 1 --seconds 0.05", capsys)
     assert results["transitions_84"] == 400

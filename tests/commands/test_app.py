@@ -25,6 +25,7 @@ from atlantis_exp.config import (
     QueryConfig,
     ReportConfig,
     SearchConfig,
+    SyncConfig,
     UiConfig,
     flatten,
     parse,
@@ -41,9 +42,11 @@ SCHEMAS: dict[str, type[Any]] = {
     "play": PlayConfig,
     "query": QueryConfig,
     "report": ReportConfig,
+    "sync": SyncConfig,
     "ui": UiConfig,
 }
 GROUPS = {path.name: sorted(file.stem for file in path.glob("*.yaml")) for path in CONF.iterdir() if path.is_dir()}
+NO_PART = ("agent", "experiment", "hydra", "space")  # of a training, or chosen otherwise
 
 
 def composed(*overrides: str) -> Config:
@@ -284,7 +287,7 @@ def test_nothing_heavy_is_loaded_before_the_config_is_checked() -> None:
 
 @pytest.mark.parametrize("experiment", GROUPS["experiment"])
 def test_every_option_of_every_group_goes_with_every_experiment(experiment: str) -> None:
-    groups = {group: options for group, options in GROUPS.items() if group not in ("agent", "experiment", "hydra", "space")}
+    groups = {group: options for group, options in GROUPS.items() if group not in NO_PART}
     for turn in range(max(map(len, groups.values()))):
         chosen = {group: options[turn % len(options)] for group, options in groups.items()}
         config = composed(f"experiment={experiment}", *(f"{group}={option}" for group, option in chosen.items()))

@@ -40,6 +40,7 @@ def tags(outputs: str, key: str) -> dict[str, str]:
     return dict(rows(outputs, "SELECT name, value FROM tags JOIN runs USING (run_uuid) WHERE key = ?", key))
 
 
+@pytest.mark.slow
 def test_runs_trained_by_processes_of_their_own_have_one_parent_and_a_repeated_sweep_the_same(
     pair: list[Config], tiny_overrides: tuple[str, ...]
 ) -> None:

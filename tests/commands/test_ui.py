@@ -26,6 +26,7 @@ from atlantis_exp.config import Config
 from atlantis_exp.tracking.store import Store
 
 REPOSITORY = Path(__file__).parents[2]
+pytestmark = pytest.mark.slow
 COMMAND = (sys.executable, "-m", "atlantis_exp", "ui")
 SECONDS = 60_000  # that a page may take, in ms
 

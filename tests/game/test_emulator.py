@@ -221,6 +221,7 @@ def test_a_restored_emulator_plays_on_as_if_never_stopped(settings: dict[str, An
         np.testing.assert_equal(state[key], leaf)  # playing on has not changed what was saved
 
 
+@pytest.mark.slow
 def test_a_restored_emulator_draws_every_pixel_as_if_never_stopped() -> None:
     """ALE's own state forgets registers of the TIA: shots, which are seldom in the crop, would be drawn elsewhere."""
     rng = np.random.default_rng(0)

@@ -85,8 +85,11 @@ def test_the_same_seed_gives_the_same_training_and_another_seed_another(
     "overrides",
     [
         ("model=cnn", "env.num_envs=1"),
-        ("model=cnn", "env.num_envs=3", "env.workers=2", "objective=double_dqn"),
-        ("model=resnet", "env.size=16", "env.num_envs=1", "optimizer=rmsprop", "objective.target.mode=train"),
+        pytest.param(("model=cnn", "env.num_envs=3", "env.workers=2", "objective=double_dqn"), marks=pytest.mark.slow),
+        pytest.param(
+            ("model=resnet", "env.size=16", "env.num_envs=1", "optimizer=rmsprop", "objective.target.mode=train"),
+            marks=pytest.mark.slow,
+        ),
         ("env.num_envs=3", "env.workers=2", "sampler=prioritized", "phase.quick.sampler=prioritized"),
         (
             "objective=quantile",
@@ -222,7 +225,7 @@ def test_updates_are_those_that_a_naive_loop_counts(
     assert tape == naive
 
 
-@pytest.mark.parametrize("num_envs", [1, 8])
+@pytest.mark.parametrize("num_envs", [1, pytest.param(8, marks=pytest.mark.slow)])
 def test_a_prioritized_training_is_the_same_whenever_it_is_committed(
     tiny: Compose, started: Start, tmp_path: Path, num_envs: int
 ) -> None:
