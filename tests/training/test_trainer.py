@@ -47,7 +47,9 @@ def curve(folder: Path, key: str) -> list[tuple[int, float]]:
     return [(record.step, record.values[key]) for record in records if key in record.values]
 
 
-@pytest.mark.parametrize("overrides", [("env.num_envs=1",), ("env.num_envs=3", "env.workers=2")])
+@pytest.mark.parametrize(
+    "overrides", [pytest.param(("env.num_envs=1",), marks=pytest.mark.slow), ("env.num_envs=3", "env.workers=2")]
+)
 def test_a_training_with_evaluations_is_the_same_as_one_without(
     tiny: Compose, started: Start, tmp_path: Path, overrides: tuple[str, ...]
 ) -> None:
