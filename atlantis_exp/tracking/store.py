@@ -265,7 +265,7 @@ class Publisher:
 
     def _run(self) -> None:
         delay, failing = self._interval, False
-        self._draining.wait(delay)  # MLflow's import would slow down whatever starts now, and what is measured then
+        self._draining.wait(4 * delay)  # MLflow's import would slow down the start, and what is measured there
         while True:
             draining = self._draining.is_set()  # asked first: what is committed before a drain is published by it
             error: Exception | None = None
