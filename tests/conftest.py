@@ -1,5 +1,14 @@
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -15,6 +24,8 @@ from atlantis_exp.training.evaluation import Episode, Evaluation
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Trainer
 
+Serving = AbstractContextManager[None]
+
 settings.register_profile("untimed", deadline=None)  # a busy machine is no failure
 settings.load_profile("untimed")
 
@@ -24,6 +35,62 @@ TINY = (  # everything that a training can do, in seconds
     *("training.learn_start=20", "training.learn_every=4", "training.batch_size=4", "training.precision=fp32"),
     *("evaluation.episodes=2", "evaluation.num_envs=1", "evaluation.every_steps=80", "evaluation.video=false"),
 )
+
+
+@pytest.fixture(scope="session")
+def free_port() -> Callable[[], int]:
+    """A port that nobody listens to."""
+
+    def found() -> int:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port: int = probe.getsockname()[1]
+        return port
+
+    return found
+
+
+@pytest.fixture(scope="session")
+def answering() -> Callable[..., None]:
+    """Waits for an MLflow server: `answering(process, port)`."""
+
+    def wait(process: "subprocess.Popen[Any]", port: int, seconds: float = 120) -> None:
+        patience = time.monotonic() + seconds
+        while True:
+            try:
+                urlopen(f"http://127.0.0.1:{port}/health", timeout=5)
+                return
+            except OSError:
+                assert process.poll() is None
+                assert time.monotonic() < patience
+                time.sleep(0.1)
+
+    return wait
+
+
+@pytest.fixture(scope="session")
+def mlflow_server(answering: Callable[..., None]) -> Callable[[Path, int], Serving]:
+    """A server on the store in a folder, which ends by SIGKILL."""
+
+    @contextmanager
+    def serving(folder: Path, port: int) -> Iterator[None]:
+        files = ("--artifacts-destination", f"{folder}/artifacts")
+        store = ("--backend-store-uri", f"sqlite:///{folder}/mlflow.db", *files)
+        process = subprocess.Popen(
+            (sys.executable, "-m", "mlflow", "server", "--port", str(port), "--workers", "1", *store),
+            env={**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # it has a process that serves
+        )
+        try:
+            answering(process, port)
+            yield
+        finally:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+    return serving
 
 
 @pytest.fixture
@@ -76,7 +143,7 @@ def recorded(tiny: Callable[..., Config]) -> Callable[..., Path]:
         steps: int = 160,
     ) -> Path:
         config = tiny(*overrides)
-        folder = RunFolder(Path(config.paths.outputs) / "runs" / config.run_name())
+        folder = RunFolder.of(config)
         journal = Journal(folder.path)
         folder.write_config(to_dict(config))
         if flops is not None:

@@ -81,17 +81,17 @@ def run_verb(
     config_name: str,
     schema: type[T],
     job: Callable[[T], None],
-    sweep: Callable[[Sequence[T]], AbstractContextManager[None]] = lambda _: nullcontext(),
+    sweep: Callable[[Sequence[T], Launcher], AbstractContextManager[None]] = lambda *_: nullcontext(),
 ) -> None:
     """Compose `conf/<config_name>.yaml` with the command line's overrides, check it, and call `job` with the result.
 
     A user's mistake ends the process with exit code 2 and one line on stderr before Hydra or the job starts; a `Fault`
     ends it with its own exit code and one line, and so does a folder that cannot be written. A sweep, and any job that
-    is left to another process, runs inside of what `sweep` makes of all configs.
+    is left to another process, runs inside of what `sweep` makes of all configs and the launcher.
     """
     try:
         configs = check(config_name, schema, sys.argv[1:])
-        is_sweep = len(configs) > 1 or not launcher(config_name, sys.argv[1:]).is_basic
+        chosen = launcher(config_name, sys.argv[1:])
     except ConfigError as error:
         leave(error)
 
@@ -109,7 +109,7 @@ def run_verb(
 
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     try:
-        with sweep(configs) if is_sweep else nullcontext():
+        with sweep(configs, chosen) if len(configs) > 1 or not chosen.is_basic else nullcontext():
             main()
     except (ConfigError, Fault, OSError) as error:
         leave(error)

@@ -7,7 +7,6 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
-from pathlib import Path
 
 from atlantis_exp.commands.app import JOB_OF, job_of
 from atlantis_exp.commands.train import final_result, train, watch_of
@@ -41,7 +40,9 @@ def train_job(config: Config) -> None:
 @contextmanager
 def _kept_output(config: Config) -> Iterator[None]:
     """What is printed goes to the run's folder, since Ray's own files of it are on whatever machine this is."""
-    folder = Path(config.paths.outputs) / "runs" / config.run_name()
+    from atlantis_exp.commands.runs import RunFolder
+
+    folder = RunFolder.of(config).path
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / _OUTPUT, "a", buffering=1) as output, redirect_stdout(output), redirect_stderr(output):
         yield
@@ -51,7 +52,7 @@ def _train_apart(config: Config) -> None:
     from atlantis_exp.commands.runs import RunFolder
     from atlantis_exp.tracking.journal import Journal, JournalError
 
-    folder = RunFolder(Path(config.paths.outputs) / "runs" / config.run_name())
+    folder = RunFolder.of(config)
     if config.resume != "never" and final_result(config, folder) is not None:
         return
     if not watch_of(folder)():

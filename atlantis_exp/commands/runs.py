@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, TextIO, TypeVar
+from typing import Any, Literal, Self, TextIO, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -49,6 +49,11 @@ class RunFolder:
     """
 
     path: Path
+
+    @classmethod
+    def of(cls, config: Config) -> Self:
+        """The folder of the training that a config is."""
+        return cls(Path(config.paths.outputs) / "runs" / config.run_name())
 
     @property
     def name(self) -> str:
@@ -94,7 +99,8 @@ class RunFolder:
             return "done"
         if self.status == "FAILED":
             return "failed"
-        return "running" if self.status == "RUNNING" and self.is_held else "interrupted"
+        has_ended = self.status not in (None, "SCHEDULED", "RUNNING")
+        return "running" if not has_ended and self.is_held else "interrupted"
 
     @property
     def is_held(self) -> bool:

@@ -263,7 +263,7 @@ class _Session:
             raise Fault(str(error)) from None
         # The time is the search's, and whatever is there of a trial is what its killed process left.
         config = dataclasses.replace(config, resume="auto", budget=dataclasses.replace(config.budget, wall_clock=None))
-        run = RunFolder(Path(config.paths.outputs) / "runs" / config.run_name())
+        run = RunFolder.of(config)
         trial.set_user_attr("run", run.name)
         with suppress(Fault, JournalError), run.held():  # what runs elsewhere stays where it is
             adopt(run.path, self.folder.path)

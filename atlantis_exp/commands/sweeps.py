@@ -48,7 +48,7 @@ def ledger(configs: Sequence[Config], swept: Sequence[str], launcher: Launcher =
         Fault: while another process runs the same sweep.
     """
     configs = list({config.run_name(): config for config in configs}.values())
-    folders = [RunFolder(Path(config.paths.outputs) / "runs" / config.run_name()) for config in configs]
+    folders = [RunFolder.of(config) for config in configs]
     _print_table(folders)
     try:
         if launcher.is_basic and configs[0].tracking.name == "none":

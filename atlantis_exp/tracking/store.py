@@ -265,7 +265,6 @@ class Publisher:
 
     def _run(self) -> None:
         delay, failing = self._interval, False
-        self._draining.wait(4 * delay)  # MLflow's import would slow down the start, and what is measured there
         while True:
             draining = self._draining.is_set()  # asked first: what is committed before a drain is published by it
             error: Exception | None = None

@@ -61,10 +61,6 @@ def sweep(tiny_overrides: tuple[str, ...], tmp_path: Path) -> Iterator[Sweep]:
             process.wait()
 
 
-def run_of(config: Config) -> RunFolder:
-    return RunFolder(Path(config.paths.outputs) / "runs" / config.run_name())
-
-
 def holder(folder: RunFolder) -> int:
     """The process that trains a run."""
     return int((folder.path / "lock").read_text().split()[1])
@@ -117,7 +113,7 @@ def test_jobs_share_the_cores_of_the_machine(
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(joblib, "cpu_count", lambda: 8)
     monkeypatch.setattr(joblib, "effective_n_jobs", lambda jobs: 8 if jobs == -1 else jobs)
-    with _shared_cores(Launcher("joblib", n_jobs), [run_of(config) for config in seeds()]):
+    with _shared_cores(Launcher("joblib", n_jobs), [RunFolder.of(config) for config in seeds()]):
         assert os.environ["OMP_NUM_THREADS"] == str(share)
     assert "OMP_NUM_THREADS" not in os.environ
 
@@ -135,13 +131,13 @@ def test_emulator_workers_keep_to_their_share_and_leave_the_identity_alone(
 
 def test_the_table_follows_the_commits_of_runs(tiny: Compose, recorded: Callable[..., Path]) -> None:
     config, other = tiny("seed=0"), tiny("seed=1")
-    folder = run_of(config)
+    folder = RunFolder.of(config)
     shown = io.StringIO()
     with folder.held():
         journal = Journal(folder.path)
         folder.write_config({})
         journal.status("RUNNING")
-        table = LiveTable([config, other], [folder, run_of(other)], Console(file=shown, width=200))
+        table = LiveTable([config, other], [folder, RunFolder.of(other)], Console(file=shown, width=200))
         for step in (40, 80):
             journal.metrics({"throughput/steps_per_second": 20.0, "throughput/hours": step / 72_000}, step)
             journal.metrics({"score/episode": 100.0 * step}, step)
@@ -154,7 +150,9 @@ def test_the_table_follows_the_commits_of_runs(tiny: Compose, recorded: Callable
     recorded("seed=1")
     table.look()
     drawn = io.StringIO()
-    LiveTable([config, other], [folder, run_of(other)], Console(file=drawn, width=120, force_terminal=True)).look()
+    LiveTable(
+        [config, other], [folder, RunFolder.of(other)], Console(file=drawn, width=120, force_terminal=True)
+    ).look()
     assert "80 of 160 steps" in drawn.getvalue()
     lines = shown.getvalue().splitlines()
     assert [line.split()[0] for line in lines] == ["running", "running", "interrupted", "done"]
@@ -171,7 +169,7 @@ def test_jobs_side_by_side_fail_and_are_killed_alone_and_the_same_command_runs_w
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the extra joblib is not installed")
     words = (*FREQUENT, "phase.quick.steps=400")
     configs = seeds(*words)
-    killed, failing, whole = (run_of(config) for config in configs)
+    killed, failing, whole = (RunFolder.of(config) for config in configs)
     failing.path.mkdir(parents=True)
     (failing.path / "checkpoints").write_text("in the way")
     command = (*words, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1,2")
@@ -204,7 +202,7 @@ def test_jobs_side_by_side_fail_and_are_killed_alone_and_the_same_command_runs_w
 def test_the_end_of_a_sweep_commits_its_jobs(sweep: Sweep, seeds: Callable[..., list[Config]], how: str) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the extra joblib is not installed")
     configs = seeds(*LONG)
-    folders = [run_of(config) for config in configs]
+    folders = [RunFolder.of(config) for config in configs]
     process = sweep(*LONG, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1,2")
     wait_for(lambda: all(trains(folder) for folder in folders[:2]))
     if how == "interrupted":
@@ -238,7 +236,7 @@ def test_on_a_ray_cluster_of_two_nodes_a_killed_workers_job_is_continued(
         process = sweep(
             *words, "hydra/launcher=ray", f"hydra.launcher.ray.init.address={cluster.address}", "seed=0,1,2"
         )
-        killed = run_of(configs[0])
+        killed = RunFolder.of(configs[0])
         wait_for(lambda: trains(killed))
         os.kill(holder(killed), signal.SIGKILL)
         assert process.wait(timeout=250) == 0, (tmp_path / "printed.txt").read_text()

@@ -237,7 +237,7 @@ def test_a_trial_below_the_median_is_committed_and_can_be_trained_to_its_end(sea
     assert pruned.state.name == "PRUNED"
     assert list(pruned.intermediate_values) == [1]
     config = config_of(session, 1)
-    folder = RunFolder(Path(config.paths.outputs) / "runs" / config.run_name())
+    folder = RunFolder.of(config)
     assert folder.state == "interrupted"
     tags = {
         key: value

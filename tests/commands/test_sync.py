@@ -2,18 +2,14 @@
 
 import gzip
 import io
-import os
 import signal
-import socket
 import sqlite3
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import Any
-from urllib.request import urlopen
 
 import PIL.Image
 import pytest
@@ -29,34 +25,17 @@ from atlantis_exp.tracking.journal import Commit, Journal, adopt, commit_bytes, 
 from atlantis_exp.tracking.store import Store, publish, standing, unfinished
 
 REPOSITORY = Path(__file__).parents[2]
+Served = Callable[[Path, int], AbstractContextManager[None]]
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
+def server(
+    tmp_path_factory: pytest.TempPathFactory, free_port: Callable[[], int], mlflow_server: Served
+) -> Iterator[tuple[str, Path]]:
     """A server's address and the folder of its database and files."""
-    folder = tmp_path_factory.mktemp("server")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    store = ("--backend-store-uri", f"sqlite:///{folder}/mlflow.db", "--artifacts-destination", f"{folder}/artifacts")
-    process = subprocess.Popen(
-        (sys.executable, "-m", "mlflow", "server", "--port", str(port), "--workers", "1", *store),
-        env={**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,  # it has a process that serves
-    )
-    patience = time.monotonic() + 60
-    while True:
-        try:
-            urlopen(f"http://127.0.0.1:{port}/health", timeout=5)
-            break
-        except OSError:
-            assert time.monotonic() < patience
-            time.sleep(0.1)
-    yield f"http://127.0.0.1:{port}", folder
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+    folder, port = tmp_path_factory.mktemp("server"), free_port()
+    with mlflow_server(folder, port):
+        yield f"http://127.0.0.1:{port}", folder
 
 
 def synced(outputs: Path, *overrides: str) -> None:

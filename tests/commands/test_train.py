@@ -2,16 +2,14 @@ import dataclasses
 import json
 import os
 import signal
-import socket
 import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import Any
-from urllib.request import urlopen
 
 import pytest
 
@@ -23,16 +21,31 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.tracking.journal import Artifact, Image, Journal, Metrics, Model, read
 from atlantis_exp.tracking.store import Store, publish
 from atlantis_exp.training.checkpoint import Checkpoints
+from atlantis_exp.training.forecast import Forecast
 
 Compose = Callable[..., Config]
+Served = Callable[[Path, int], AbstractContextManager[None]]
 REPOSITORY = Path(__file__).parents[2]
 COMMAND = (sys.executable, "-m", "atlantis_exp")
 SHORT = ("phase.quick.steps=40", "evaluation.at_end=false", "evaluation.every_steps=null")
 LONG = ("phase.quick.steps=100_000", "evaluation.every_steps=null", "tracking.commit_seconds=0.2")
 
 
-def run_of(config: Config) -> RunFolder:
-    return RunFolder(Path(config.paths.outputs) / "runs" / config.run_name())
+def test_the_forecast_is_measured_before_there_is_anything_for_mlflow(
+    tiny: Compose, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = tiny(*SHORT, "tracking=mlflow", "budget.forecast=warn")
+    folder, seen = RunFolder.of(config), []
+
+    def measured(_: Config, steps_done: int) -> Forecast:
+        time.sleep(0.5)  # for a publisher that would begin
+        seen.append((folder.state, folder.status, (tmp_path / "mlflow.lock").exists(), steps_done))
+        return Forecast(1, 40, 0, 1, 0, 1)
+
+    monkeypatch.setattr("atlantis_exp.build.build_forecast", measured)
+    train(config)
+    assert seen == [("running", None, False, 0)]
+    assert folder.state == "done"
 
 
 def session(config: Config, tiny_overrides: tuple[str, ...], *overrides: str, **environment: str) -> Any:
@@ -63,7 +76,7 @@ def test_a_run_that_has_ended_is_reported_and_not_trained_again(
 ) -> None:
     config = tiny("evaluation.every_steps=null")
     train(config)
-    folder = run_of(config)
+    folder = RunFolder.of(config)
     files = {path: path.stat().st_mtime_ns for path in folder.path.rglob("*")}
     capsys.readouterr()
     train(config)
@@ -76,7 +89,7 @@ def test_a_larger_budget_continues_a_run_that_its_budget_ended(tiny: Compose) ->
     for steps in ("80", "120", "null"):
         config = tiny(f"budget.steps={steps}", "evaluation.at_end=false", "evaluation.every_steps=null")
         train(config)
-    result = run_of(config).result
+    result = RunFolder.of(config).result
     assert result is not None
     assert (result.outcome, result.steps) == ("finished", 160)
     unbroken = tiny("evaluation.at_end=false", "evaluation.every_steps=null", f"paths.outputs={config.paths.outputs}/u")
@@ -99,7 +112,7 @@ def test_a_damaged_file_of_a_run_is_one_clear_line_and_is_written_anew_once_it_i
 ) -> None:
     config = tiny(*SHORT, "budget.steps=20")
     train(config)
-    folder = run_of(config)
+    folder = RunFolder.of(config)
     path = folder.path / name
     whole = json.loads(path.read_bytes())
     path.write_text(damaged)
@@ -122,11 +135,11 @@ def test_a_damaged_run_is_no_obstacle_to_another(tiny: Compose, capsys: pytest.C
 def test_a_config_that_was_lost_is_written_again(tiny: Compose) -> None:
     config = tiny(*SHORT)
     train(config)
-    (run_of(config).path / "config.json").unlink()
-    assert str(run_of(config).state) == "missing"
+    (RunFolder.of(config).path / "config.json").unlink()
+    assert str(RunFolder.of(config).state) == "missing"
     train(config)
-    assert run_of(config).config == to_dict(config)
-    assert run_of(config).state == "done"
+    assert RunFolder.of(config).config == to_dict(config)
+    assert RunFolder.of(config).state == "done"
 
 
 def test_resume_must_refuses_to_start_and_resume_never_keeps_what_was_there(tiny: Compose) -> None:
@@ -135,13 +148,13 @@ def test_resume_must_refuses_to_start_and_resume_never_keeps_what_was_there(tiny
     for resume in ("auto", "must", "never"):
         config = tiny(*SHORT, f"resume={resume}")
         train(config)
-    names = sorted(path.name for path in run_of(config).path.parent.iterdir())
+    names = sorted(path.name for path in RunFolder.of(config).path.parent.iterdir())
     assert names == [config.run_name(), f"{config.run_name()}~1"]
 
 
 def test_a_run_that_another_process_holds_is_not_touched(tiny: Compose) -> None:
     config = tiny()
-    folder = run_of(config)
+    folder = RunFolder.of(config)
     holder = f"process {os.getpid()} on {os.uname().nodename}"
     with folder.held(), pytest.raises(Fault, match=f"run {folder.name} is held by {holder}") as fault:
         train(config)
@@ -156,7 +169,7 @@ def test_time_that_is_up_commits_and_says_how_to_continue(tiny: Compose) -> None
     with pytest.raises(Fault, match=r"budget\.wall_clock: run .* is committed at step .*; continue with: ") as fault:
         train(config)
     assert fault.value.exit_code == 124
-    assert run_of(config).state == "interrupted"
+    assert RunFolder.of(config).state == "interrupted"
 
 
 @pytest.mark.parametrize(
@@ -191,48 +204,46 @@ def test_a_second_interrupt_ends_the_process_at_once() -> None:
     assert subprocess.run((sys.executable, "-c", code), cwd=REPOSITORY, check=False).returncode == -signal.SIGINT
 
 
-def test_under_slurm_sigterm_is_a_warning_and_sigusr2_goes_on_to_the_handler_before(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+@pytest.fixture
+def under_slurm(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """A job of Slurm's; the signals that reach the handler which requeues it."""
     monkeypatch.setenv("SLURM_JOB_ID", "7")
-    tape = []
+    tape: list[int] = []
     before = signal.signal(signal.SIGUSR2, lambda number, _: tape.append(number))
-    try:
-        stop = StopRequest()
-        with stop.installed():
-            signal.raise_signal(signal.SIGTERM)
-            assert stop()
-            assert stop.was_a_warning()
-            assert not stop()
-            signal.raise_signal(signal.SIGUSR2)
-            assert stop()
-            assert not stop.was_a_warning()
-            assert tape == []
-            with pytest.raises(SystemExit):
-                stop.leave("done")
-        assert tape == [signal.SIGUSR2]
-    finally:
-        signal.signal(signal.SIGUSR2, before)
+    yield tape
+    signal.signal(signal.SIGUSR2, before)
+
+
+def test_under_slurm_sigterm_is_a_warning_and_sigusr2_goes_on_to_the_handler_before(
+    under_slurm: list[int],
+) -> None:
+    stop = StopRequest()
+    with stop.installed():
+        signal.raise_signal(signal.SIGTERM)
+        assert stop()
+        assert stop.was_a_warning()
+        assert not stop()
+        signal.raise_signal(signal.SIGUSR2)
+        assert stop()
+        assert not stop.was_a_warning()
+        assert under_slurm == []
+        with pytest.raises(SystemExit):
+            stop.leave("done")
+    assert under_slurm == [signal.SIGUSR2]
 
 
 def test_under_slurm_the_sigterm_of_time_that_is_up_does_not_undo_the_sigusr2_before_it(
-    monkeypatch: pytest.MonkeyPatch,
+    under_slurm: list[int],
 ) -> None:
-    monkeypatch.setenv("SLURM_JOB_ID", "7")
-    tape = []
-    before = signal.signal(signal.SIGUSR2, lambda number, _: tape.append(number))
-    try:
-        stop = StopRequest()
-        with stop.installed():
-            signal.raise_signal(signal.SIGUSR2)
-            signal.raise_signal(signal.SIGTERM)  # the commit took long
-            assert stop()
-            assert not stop.was_a_warning()
-            with pytest.raises(SystemExit):
-                stop.leave("done")
-        assert tape == [signal.SIGUSR2]
-    finally:
-        signal.signal(signal.SIGUSR2, before)
+    stop = StopRequest()
+    with stop.installed():
+        signal.raise_signal(signal.SIGUSR2)
+        signal.raise_signal(signal.SIGTERM)  # the commit took long
+        assert stop()
+        assert not stop.was_a_warning()
+        with pytest.raises(SystemExit):
+            stop.leave("done")
+    assert under_slurm == [signal.SIGUSR2]
 
 
 @pytest.fixture
@@ -250,7 +261,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_full_disk_is_one_clear_line_and_costs_nothing_committed(tiny: Compose, small_disk: Path) -> None:
     chosen = (*SHORT, "phase.quick.steps=100", "tracking.commit_seconds=1e-9")
     config = tiny(*chosen, f"paths.outputs={small_disk}")
-    folder, ballast = run_of(config), small_disk / "ballast"
+    folder, ballast = RunFolder.of(config), small_disk / "ballast"
     train(dataclasses.replace(config, budget=dataclasses.replace(config.budget, steps=50)))
     for space in (0, 4, 8, 64):  # KiB: no config, no replay segment, no state, no tensors
         filesystem = os.statvfs(small_disk)
@@ -284,7 +295,7 @@ def test_a_commit_that_the_disk_refuses_is_one_clear_line_and_costs_nothing_comm
         patched.setattr(os, "fsync", full)
         with pytest.raises(Fault, match="No space left on device; continue with: "):
             train(config)
-    folder = run_of(config)
+    folder = RunFolder.of(config)
     assert folder.state == "interrupted"
     train(config)
     unbroken = tiny(*SHORT, f"paths.outputs={config.paths.outputs}/unbroken")
@@ -295,7 +306,7 @@ def test_a_commit_that_the_disk_refuses_is_one_clear_line_and_costs_nothing_comm
 def test_a_journal_that_was_cut_is_one_clear_line(tiny: Compose) -> None:
     config = tiny("budget.steps=80", "evaluation.at_end=false", "evaluation.every_steps=null")
     train(config)
-    path = run_of(config).path / "journal.jsonl"
+    path = RunFolder.of(config).path / "journal.jsonl"
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(Fault, match="is shorter than the checkpoint says"):
         train(tiny("evaluation.at_end=false", "evaluation.every_steps=null"))
@@ -324,7 +335,7 @@ def journaled(folder: Path) -> list[tuple[Any, ...]]:
 def test_a_killed_run_is_shown_as_interrupted_then_continued_and_sigterm_ends_it_with_143(
     tiny: Compose, tiny_overrides: tuple[str, ...]
 ) -> None:
-    folder = run_of(tiny(*LONG))
+    folder = RunFolder.of(tiny(*LONG))
     killed = session(tiny(*LONG), tiny_overrides, *LONG)
     wait_for(lambda: generation(folder) > 0)
     assert str(folder.state) == "running"
@@ -351,9 +362,9 @@ def test_the_next_command_tells_mlflow_of_a_run_that_was_killed(tiny: Compose) -
     config = tiny(*SHORT, "budget.steps=20", "tracking=mlflow")
     outputs = Path(config.paths.outputs)
     train(config)
-    journal = Journal(run_of(config).path)
+    journal = Journal(RunFolder.of(config).path)
     journal.status("RUNNING")
-    publish(run_of(config).path, Store(outputs))
+    publish(RunFolder.of(config).path, Store(outputs))
 
     def shown() -> list[tuple[str, str]]:
         query = "SELECT status, value FROM runs JOIN tags USING (run_uuid) WHERE key = 'resumable'"
@@ -365,38 +376,11 @@ def test_the_next_command_tells_mlflow_of_a_run_that_was_killed(tiny: Compose) -
     assert shown() == [("KILLED", "true")]
 
 
-@contextmanager
-def mlflow_server(folder: Path, port: int) -> Iterator[None]:
-    """A server on the store in a folder, which ends by SIGKILL."""
-    store = ("--backend-store-uri", f"sqlite:///{folder}/mlflow.db", "--artifacts-destination", f"{folder}/artifacts")
-    process = subprocess.Popen(
-        (sys.executable, "-m", "mlflow", "server", "--port", str(port), "--workers", "1", *store),
-        env={**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,  # it has a process that serves
-    )
-
-    def answers() -> bool:
-        try:
-            return bool(urlopen(f"http://127.0.0.1:{port}/health", timeout=5).status == 200)
-        except OSError:
-            return False
-
-    try:
-        wait_for(answers)
-        yield
-    finally:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-
-
 @pytest.mark.slow
 def test_a_server_that_is_gone_for_a_while_has_everything_once_it_is_back(
-    tiny: Compose, tiny_overrides: tuple[str, ...], tmp_path: Path
+    tiny: Compose, tiny_overrides: tuple[str, ...], tmp_path: Path, free_port: Callable[[], int], mlflow_server: Served
 ) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    port = free_port()
     server = tmp_path / "server"
     server.mkdir()
     chosen = (
@@ -404,7 +388,7 @@ def test_a_server_that_is_gone_for_a_while_has_everything_once_it_is_back(
         *("evaluation.every_steps=1_000", "tracking.histogram_episodes=50"),
     )
     config = tiny(*chosen)
-    folder = run_of(config).path
+    folder = RunFolder.of(config).path
 
     def published() -> int:
         file = folder / "published.json"

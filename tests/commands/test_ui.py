@@ -10,11 +10,9 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from urllib.request import urlopen
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -66,11 +64,9 @@ def outputs(page: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noq
 
 
 @pytest.fixture(scope="module")
-def address(outputs: Path) -> Iterator[str]:
+def address(outputs: Path, free_port: Callable[[], int], answering: Callable[..., None]) -> Iterator[str]:
     """What the command prints, once the server answers."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     server = subprocess.Popen(
         (*COMMAND, f"port={port}", f"paths.outputs={outputs}"),
         cwd=REPOSITORY,
@@ -81,14 +77,7 @@ def address(outputs: Path) -> Iterator[str]:
     )
     assert server.stdout is not None
     shown = server.stdout.readline().split()[-1]
-    patience = time.monotonic() + 60
-    while True:
-        try:
-            urlopen(f"http://127.0.0.1:{port}/health", timeout=5)
-            break
-        except OSError:
-            assert time.monotonic() < patience
-            time.sleep(0.2)
+    answering(server, port)
     yield shown
     os.killpg(server.pid, signal.SIGKILL)
     server.wait()

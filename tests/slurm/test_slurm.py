@@ -70,10 +70,6 @@ def wait_for(condition: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
-def run_of(config: Config) -> RunFolder:
-    return RunFolder(Path(config.paths.outputs) / "runs" / config.run_name())
-
-
 def refusal(*launcher: str) -> str:
     with pytest.raises(ConfigError) as error:
         check("config", Config, ["-m", "seed=0,1", "hydra/launcher=slurm", *launcher])
@@ -123,7 +119,7 @@ def test_jobs_that_are_preempted_requeued_timed_out_or_cancelled_end_as_the_unbr
 ) -> None:
     chosen = ("phase.quick.steps=1_000", "evaluation.every_steps=null", "tracking=mlflow", "tracking.commit_seconds=1")
     configs = [tiny(*chosen, f"seed={seed}") for seed in range(4)]
-    folders = [run_of(config) for config in configs]
+    folders = [RunFolder.of(config) for config in configs]
     (tmp_path / "sitecustomize.py").write_text(AUDIT.format(log=str(tmp_path / "told")))
     environment = {**slurm, "PYTHONPATH": str(tmp_path)}
     overrides = (*tiny_overrides, *chosen, f"paths.outputs={tmp_path}", "seed=0,1,2,3", *LAUNCHER)

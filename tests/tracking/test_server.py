@@ -3,17 +3,15 @@
 import os
 import shutil
 import signal
-import socket
 import stat
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
-from urllib.request import urlopen
 
 import psutil
 import pytest
@@ -79,7 +77,7 @@ def database() -> Iterator[str]:
 
 
 @contextmanager
-def serving(folder: Path, database: str, port: int) -> Iterator[int]:
+def serving(folder: Path, database: str, port: int, answering: Callable[..., None]) -> Iterator[int]:
     """The team's server, which ends by SIGKILL; yields its process group."""
     environment = {**os.environ, "ATLANTIS_DATABASE": database, "PYTHON": sys.executable}
     with open(folder.with_suffix(".log"), "a") as log:
@@ -91,15 +89,7 @@ def serving(folder: Path, database: str, port: int) -> Iterator[int]:
             start_new_session=True,
         )
     try:
-        patience = time.monotonic() + 120
-        while True:
-            try:
-                urlopen(f"http://127.0.0.1:{port}/health", timeout=5)
-                break
-            except OSError:
-                assert process.poll() is None, folder.with_suffix(".log").read_text()
-                assert time.monotonic() < patience
-                time.sleep(0.2)
+        answering(process, port)
         yield process.pid
     finally:
         os.killpg(process.pid, signal.SIGKILL)
@@ -108,14 +98,16 @@ def serving(folder: Path, database: str, port: int) -> Iterator[int]:
 
 @pytest.mark.slow
 def test_eight_runs_write_at_once_while_the_server_is_killed_and_started_again(
-    tmp_path: Path, database: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    database: str,
+    free_port: Callable[[], int],
+    answering: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     import psycopg2
     from mlflow.server import get_app_client
 
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     address, outputs, server = f"http://127.0.0.1:{port}", tmp_path / "outputs", tmp_path / "server"
     names = [f"run-{number}" for number in range(8)]
 
@@ -124,7 +116,7 @@ def test_eight_runs_write_at_once_while_the_server_is_killed_and_started_again(
             cursor.execute("SELECT count(*) FROM metrics")
             return int(cursor.fetchone()[0])
 
-    with serving(server, database, port) as group:
+    with serving(server, database, port, answering) as group:
         secrets = dict(line.split("=") for line in (server / "secrets").read_text().split())
         for name in ("secrets", "auth.ini"):
             assert stat.S_IMODE((server / name).stat().st_mode) == 0o600
@@ -147,7 +139,7 @@ def test_eight_runs_write_at_once_while_the_server_is_killed_and_started_again(
             time.sleep(0.2)
     assert all(writer.poll() is None for writer in writers)
     time.sleep(2.0)
-    with serving(server, database, port):
+    with serving(server, database, port, answering):
         assert [writer.wait() for writer in writers] == [0] * 8
 
         with closing(psycopg2.connect(database.replace("+psycopg2", ""))) as connection, connection.cursor() as cursor:
