@@ -39,6 +39,33 @@ TREES = {
 }
 
 
+RUNGS = {  # of the ladder from the report's recipe to experiment=fast: the keys that each changes
+    "ablation_01_environments": {"env.num_envs", "training.learn_every", "training.learn_start", "training.batch_size"},
+    "ablation_02_optimizer": {"optimizer.name", "optimizer.lr", "optimizer.eps", "optimizer.weight_decay", "phase.single.lr"},
+    "ablation_03_target": {"objective.target.tau", "objective.target.every"},
+    "ablation_04_epsilon": {"epsilon.name", "epsilon.start", "epsilon.end", "epsilon.decay", "epsilon.steps"},
+    "ablation_05_n_step": {"objective.n_step"},
+    "ablation_06_clip": {"objective.reward_clip"},
+    "ablation_07_double": {"objective.name"},
+    "ablation_08_dueling": {"model.head"},
+}
+LAST_RUNGS = {  # from the report's head and objective to those of experiment=fast
+    "ablation_09_quantile": {"objective.name", "objective.quantiles", "model.head"},
+    "ablation_10_life_loss": {"objective.terminal_on_life_loss"},
+    "fast": {"env.crop"},
+}
+
+
+@pytest.mark.parametrize(("first", "rungs"), [("ablation_00_report", RUNGS), ("ablation_06_clip", LAST_RUNGS)])
+def test_each_rung_of_the_ablation_changes_what_it_says_and_nothing_else(first: str, rungs: dict[str, set[str]]) -> None:
+    before = flatten(composed_tree(f"experiment={first}"))
+    for rung, keys in rungs.items():
+        after = flatten(composed_tree(f"experiment={rung}"))
+        different = {key for key in before.keys() | after.keys() if before.get(key) != after.get(key)}
+        assert {key for key in different if not key.startswith("evaluation.") and key != "phase.single.steps"} == keys
+        before = after
+
+
 def changed(tree: Tree, key: str, value: Any) -> Tree:
     tree = copy.deepcopy(tree)
     *parents, last = key.split(".")
