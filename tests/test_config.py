@@ -41,7 +41,13 @@ TREES = {
 
 RUNGS = {  # of the ladder from the report's recipe to experiment=fast: the keys that each changes
     "ablation_01_environments": {"env.num_envs", "training.learn_every", "training.learn_start", "training.batch_size"},
-    "ablation_02_optimizer": {"optimizer.name", "optimizer.lr", "optimizer.eps", "optimizer.weight_decay", "phase.single.lr"},
+    "ablation_02_optimizer": {
+        "optimizer.name",
+        "optimizer.lr",
+        "optimizer.eps",
+        "optimizer.weight_decay",
+        "phase.single.lr",
+    },
     "ablation_03_target": {"objective.target.tau", "objective.target.every"},
     "ablation_04_epsilon": {"epsilon.name", "epsilon.start", "epsilon.end", "epsilon.decay", "epsilon.steps"},
     "ablation_05_n_step": {"objective.n_step"},
@@ -57,7 +63,9 @@ LAST_RUNGS = {  # from the report's head and objective to those of experiment=fa
 
 
 @pytest.mark.parametrize(("first", "rungs"), [("ablation_00_report", RUNGS), ("ablation_06_clip", LAST_RUNGS)])
-def test_each_rung_of_the_ablation_changes_what_it_says_and_nothing_else(first: str, rungs: dict[str, set[str]]) -> None:
+def test_each_rung_of_the_ablation_changes_what_it_says_and_nothing_else(
+    first: str, rungs: dict[str, set[str]]
+) -> None:
     before = flatten(composed_tree(f"experiment={first}"))
     for rung, keys in rungs.items():
         after = flatten(composed_tree(f"experiment={rung}"))
