@@ -101,7 +101,7 @@ def _presets(model: str) -> tuple[str, ...]:
     fitting = [
         path.stem
         for path in paths
-        if all(choice.get("override /model", model) == model for choice in _plain(path).get("defaults", []))
+        if _choices(path).get("override /model", model) == model
     ]
     return ("none", *fitting)
 
@@ -115,7 +115,12 @@ def _preset(name: str, choices: tuple[str, ...]) -> dict[str, str]:
 @cache
 def _defaults() -> dict[str, str]:
     """The option of each group that is taken unless another is asked for."""
-    entries = _plain(CONF / "config.yaml")["defaults"]
+    return _choices(CONF / "config.yaml")
+
+
+def _choices(path: Path) -> dict[str, str]:
+    """The options that a config file takes of groups; other files that it is built on are none."""
+    entries = _plain(path).get("defaults", [])
     return {group: option for entry in entries if isinstance(entry, dict) for group, option in entry.items()}
 
 

@@ -20,6 +20,7 @@ TITLES = {
     "model=resnet sampler=top_half seed=1": "resnet top_half s1",
     "experiment=quick": "cnn uniform s0 quick",
     "experiment=paper_resnet seed=2": "resnet uniform top_half s2 paper_resnet",
+    "experiment=ablation_05_n_step": "cnn uniform s0 adam linear_steps ablation_05_n_step",
     "env=atlantis_v5": "cnn uniform s0 atlantis_v5",
     "env.num_envs=16": "cnn uniform s0 num_envs=16",
     "optimizer.lr=0.0001": "cnn uniform s0 lr=0.0001",
