@@ -37,11 +37,12 @@ def _words(config: Config) -> tuple[list[str], list[str]]:
     words = [getattr(config, group).name for group in _NAMED[2:] if getattr(config, group).name != _defaults()[group]]
     env = _nearest_env(config)
     words += [env] if env != _defaults()["env"] else []
-    choices = (f"env={env}", *(f"{group}={getattr(config, group).name}" for group in _NAMED))
+    named = {group: getattr(config, group).name for group in _NAMED}
+    choices = (f"env={env}", *(f"{group}={option}" for group, option in named.items()))
     leaves = _leaves(config)
     # The first of the nearest: no preset goes before any that is as near.
     preset, differing = min(
-        ((name, _differing(leaves, _preset(name, choices))) for name in _presets(config.model.name)),
+        ((name, _differing(leaves, _preset(name, choices))) for name in _presets(**named)),
         key=lambda candidate: len(candidate[1]),
     )
     words += [preset] if preset != "none" else []
@@ -95,15 +96,19 @@ def _nearest_env(config: Config) -> str:
 
 
 @cache
-def _presets(model: str) -> tuple[str, ...]:
-    """`none`, then the presets that are not made for another network."""
-    paths = [path for path in sorted((CONF / "experiment").glob("*.yaml")) if path.stem != "none"]
-    fitting = [
-        path.stem
-        for path in paths
-        if _choices(path).get("override /model", model) == model
-    ]
-    return ("none", *fitting)
+def _presets(**named: str) -> tuple[str, ...]:
+    """`none`, then the presets that may be near a config with these options of the named groups.
+
+    Not those for another network, nor, of those that build on others, any with another option than the config's: they
+    are many, and a step in a direction that the config has not taken.
+    """
+    near = ["none"]
+    for path in sorted((CONF / "experiment").glob("*.yaml")):
+        choices = _choices(path)
+        groups = _NAMED if _bases(path) else ("model",)
+        if path.stem != "none" and all(choices.get(f"override /{key}", named[key]) == named[key] for key in groups):
+            near.append(path.stem)
+    return tuple(near)
 
 
 @cache
@@ -119,9 +124,19 @@ def _defaults() -> dict[str, str]:
 
 
 def _choices(path: Path) -> dict[str, str]:
-    """The options that a config file takes of groups; other files that it is built on are none."""
+    """The options that a config file, or one that it builds on, takes of groups."""
+    choices: dict[str, str] = {}
+    for base in _bases(path):
+        choices |= _choices(base)
+    for entry in _plain(path).get("defaults", []):
+        choices |= entry if isinstance(entry, dict) else {}
+    return choices
+
+
+def _bases(path: Path) -> list[Path]:
+    """The files that a config file builds on."""
     entries = _plain(path).get("defaults", [])
-    return {group: option for entry in entries if isinstance(entry, dict) for group, option in entry.items()}
+    return [path.with_name(f"{entry}.yaml") for entry in entries if isinstance(entry, str) and entry != "_self_"]
 
 
 @cache
