@@ -89,9 +89,15 @@ class FrameStore:
             target[i * size : (i + 1) * size] = lz4.block.decompress(data, uncompressed_size=size, dict=self.dictionary)
         return frames
 
-    def segment(self, ids: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint8]]:
-        """Return the encoded frames of stored `ids`: their lengths in bytes and the bytes one after another."""
-        return self._lengths[ids % self.capacity], np.frombuffer(bytearray().join(self._encoded(ids)), np.uint8)
+    def segment(self, first_id: int) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint8]]:
+        """Return the encoded frames since the stored `first_id`: their lengths in bytes, and the bytes in one piece."""
+        slots = np.arange(first_id, self.next_id) % self.capacity
+        lengths = self._lengths[slots]
+        spans = np.stack((self._starts[slots], self._starts[slots] + lengths), axis=1)
+        wraps = np.flatnonzero(spans[1:, 0] != spans[:-1, 1]) + 1
+        # Whole stretches of the ring: an object for every frame keeps the garbage collector busy for seconds.
+        stretches = (self._buffer[span[0, 0] : span[-1, 1]] for span in np.split(spans, wraps) if len(span))
+        return lengths, np.frombuffer(bytearray().join(stretches), np.uint8)
 
     def _encoded(self, ids: npt.NDArray[np.int64]) -> list[memoryview]:
         slots = ids % self.capacity

@@ -197,9 +197,8 @@ class ReplayMemory:
         if since > self.next_id:
             raise ValueError(f"replay has {self.next_id:,} observations behind it, so none since {since:,}")
         first_id = max(since, self.oldest_id)
-        ids = np.arange(first_id, self.next_id)
-        slots = ids % self.capacity
-        lengths, data = self._frames.segment(ids)
+        slots = np.arange(first_id, self.next_id) % self.capacity
+        lengths, data = self._frames.segment(first_id)
         return {
             "first_id": first_id,
             "oldest_id": self.oldest_id,
