@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, Literal, TypeVar
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -221,8 +222,12 @@ class Learner:
         self._target.refresh()
 
     def _input(self, states: npt.NDArray[np.uint8]) -> torch.Tensor:
-        """Return states in [0, 1] in the precision of the forward pass."""
-        return torch.from_numpy(states).to(self.device).to(self.dtype).div_(255)
+        """Return states in [0, 1] in the precision of the forward pass, channels last."""
+        batch, channels, height, width = states.shape
+        # Channels move while they are bytes: torch takes twice as long, and three times as long in bfloat16.
+        pixels = cv2.merge([states[:, channel].reshape(-1, width) for channel in range(channels)])
+        last = torch.from_numpy(pixels).to(self.device).to(self.dtype).div_(255).view(batch, height, width, channels)
+        return last.permute(0, 3, 1, 2)
 
     def _measure(self, means: torch.Tensor) -> None:
         gradient_norm = nn.utils.get_total_norm([p.grad for p in self.network.parameters() if p.grad is not None])

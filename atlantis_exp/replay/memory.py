@@ -176,13 +176,13 @@ class ReplayMemory:
             steps += forward > 0
         now, then = self._state(ids), self._state(last)
         # A step apart, two states have all frames but one in common.
-        frames = self._frames.decode(np.hstack((now, then[:, -1:] if returns.n_step == 1 else then)))
+        frames = self._frames.decode(np.vstack((now, then[-1:] if returns.n_step == 1 else then)))
         terminal = self._terminal[last % self.capacity]
         return Transitions(
-            s_t=frames[:, : self.stack],
+            s_t=frames[: self.stack].swapaxes(0, 1),
             a_t=self._action[first % self.capacity].astype(np.int64),
             r_t=r_t.astype(np.float32),
-            s_tpm=frames[:, -self.stack :],
+            s_tpm=frames[-self.stack :].swapaxes(0, 1),
             discount=np.where(terminal, 0.0, returns.gamma**steps).astype(np.float32),
         )
 
@@ -316,11 +316,11 @@ class ReplayMemory:
             k += self._forward.item(slot)
 
     def _state(self, newest: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Return the ids of states' observations, (B, stack), oldest first."""
+        """Return the ids of states' observations, (stack, B), oldest first."""
         newest_first = [newest]
         for _ in range(self.stack - 1):
             newest_first.append(newest_first[-1] - self._back[newest_first[-1] % self.capacity])
-        return np.stack(newest_first[::-1], axis=1)
+        return np.stack(newest_first[::-1])
 
     def _successors(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         if not np.all(self.available(ids)):
