@@ -1,43 +1,55 @@
-"""Draw `docs/images/fast.png`: training and evaluation scores of docs/results.md by steps and by hours.
+"""Draw `docs/images/fast.png` from `docs/data/fast.csv`: scores of docs/results.md by steps and by hours.
 
-`python docs/make_results_picture.py OUTPUTS...`, from the root of the checkout, where each OUTPUTS is a folder that the
-trainings of docs/results.md wrote. Prints where each run stands at every 100,000 steps.
+`python docs/make_results_picture.py [OUTPUTS...]`, from the root of the checkout. The trainings in the folders OUTPUTS
+enter the table first, in the place of what it has of runs of the same names.
 """
 
+import csv
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from atlantis_exp.commands.runs import RunFolder, all_runs
-from atlantis_exp.media import BLUE, GREEN, GREY, PURPLE, VERMILLION
+from atlantis_exp.media import BLUE, GREEN, GREY, VERMILLION
 from atlantis_exp.tracking.journal import Metrics, read, read_commit
 
-KEYS = ("score/mean_20", "score/mean_100", "learning/updates", "throughput/frames", "throughput/hours")
+TABLE = Path("docs/data/fast.csv")
+KEYS = {
+    "hours": "throughput/hours",
+    "updates": "learning/updates",
+    "mean_20": "score/mean_20",
+    "mean_100": "score/mean_100",
+}
+EVALUATION = "evaluation/mean"
+COLUMNS = ("run", "step", *KEYS, "evaluation")
+EVERY = 10_000  # steps between two rows of the table; evaluations have rows of their own
 RANDOM = 20_873  # a random player's mean (docs/reproduction.md)
 
 
 def main(outputs: Sequence[Path]) -> None:
-    """Read the journals and draw a line a run, with a point for each evaluation."""
+    """Bring the table up to date and draw a line a run, with a point for each evaluation."""
+    runs = [run for folder in outputs for run in all_runs(folder)]
+    rows = [row for row in csv.DictReader(TABLE.open()) if row["run"] not in {run.name for run in runs}]
+    rows += (dict(zip(COLUMNS, row, strict=True)) for run in runs for row in rows_of(run))
+    rows.sort(key=lambda row: row["run"])
+    with TABLE.open("w") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
     figure = Figure(figsize=(11, 4.5), dpi=100, layout="constrained")
     by_steps, by_hours = figure.subplots(1, 2, sharey=True)
-    runs = [run for folder in outputs for run in all_runs(folder)]
-    for colour, run in zip((VERMILLION, BLUE, GREEN, PURPLE), runs, strict=False):
-        config = run.config
-        label = (
-            f"{config['model']['name']}, n_step={config['objective']['n_step']}, "
-            f"epsilon {config['epsilon']['end']:g}, learn_every={config['training']['learn_every']}"
-        )
-        print(f"{run.name}: {label}")
-        curve, evaluated = curves_of(run)
-        steps, scores, *_, hours = curve
-        for row in np.searchsorted(steps, np.arange(1e5, steps[-1], 1e5)):
-            print(*(f"{column[row]:12,.2f}" for column in curve))
-        for axes, x in ((by_steps, steps / 1e6), (by_hours, hours)):
-            axes.plot(x, scores, color=colour, label=label, linewidth=1)
-            axes.plot(np.interp(evaluated[0], steps, x), evaluated[1], "o", color=colour)
+    for colour, (name, points) in zip(
+        (VERMILLION, BLUE, GREEN), groupby(rows, key=lambda row: row["run"]), strict=False
+    ):
+        of_run = list(points)
+        evaluated = [row for row in of_run if row["evaluation"]]
+        for axes, key, unit in ((by_steps, "step", 1e6), (by_hours, "hours", 1)):
+            axes.plot(*columns(of_run, key, "mean_20", unit), color=colour, label=name, linewidth=1)
+            axes.plot(*columns(evaluated, key, "evaluation", unit), "o", color=colour)
     for axes in (by_steps, by_hours):
         axes.axhline(RANDOM, color=GREY, linestyle=":", linewidth=1)
     by_steps.set(yscale="log", xlabel="million steps", ylabel="score: mean of 20 in training, evaluations as points")
@@ -46,20 +58,26 @@ def main(outputs: Sequence[Path]) -> None:
     figure.savefig("docs/images/fast.png")
 
 
-def curves_of(run: RunFolder) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Steps and, at each, the KEYS, as far as the run is committed; steps and means of its evaluations."""
+def columns(rows: list[dict[str, str]], x: str, y: str, unit: float) -> tuple[list[float], list[float]]:
+    """Two columns as numbers."""
+    return [float(row[x]) / unit for row in rows], [float(row[y]) for row in rows]
+
+
+def rows_of(run: RunFolder) -> Iterator[list[str]]:
+    """The table's rows of a run, as far as it is committed."""
     commit = read_commit(run.path)
     assert commit is not None
     latest: dict[str, float] = {}
-    rows, evaluations = [], []
+    written = 0
     for _, record in read(run.path, 0, commit.offset):
-        if isinstance(record, Metrics):
-            latest |= record.values
-            if KEYS[0] in record.values and all(key in latest for key in KEYS):
-                rows.append([record.step, *(latest[key] for key in KEYS)])
-            if "evaluation/mean" in record.values:
-                evaluations.append([record.step, record.values["evaluation/mean"]])
-    return list(np.array(rows).T), list(np.array(evaluations).reshape(-1, 2).T)
+        if not isinstance(record, Metrics):
+            continue
+        latest |= record.values
+        evaluation = record.values.get(EVALUATION)
+        if all(key in latest for key in KEYS.values()) and (evaluation or record.step >= written + EVERY):
+            written = record.step
+            values = (f"{latest[key]:.6g}" for key in KEYS.values())
+            yield [run.name, f"{record.step}", *values, "" if evaluation is None else f"{evaluation:.6g}"]
 
 
 if __name__ == "__main__":
