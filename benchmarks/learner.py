@@ -47,7 +47,9 @@ def update_of(config: Config) -> Callable[[], object]:
     """An update of a learner on a batch of noise; sets torch's threads to what the learner has in a training."""
     learner, batch_size = build_learner(config), config.training.batch_size
     rng = np.random.default_rng(0)
-    states = rng.integers(0, 256, (batch_size, config.env.stack + 1, config.env.size, config.env.size), np.uint8)
+    # As the replay memory hands them over: frame by frame, seen as state by state.
+    frames = rng.integers(0, 256, (config.env.stack + 1, batch_size, config.env.size, config.env.size), np.uint8)
+    states = frames.swapaxes(0, 1)
     return functools.partial(
         learner.update,
         states[:, :-1],

@@ -7,7 +7,7 @@ enter the table first, in the place of what it has of runs of the same names.
 import csv
 import sys
 from collections.abc import Iterator, Sequence
-from itertools import groupby
+from itertools import cycle, groupby
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -32,7 +32,8 @@ RANDOM = 20_873  # a random player's mean (docs/reproduction.md)
 def main(outputs: Sequence[Path]) -> None:
     """Bring the table up to date and draw a line a run, with a point for each evaluation."""
     runs = [run for folder in outputs for run in all_runs(folder)]
-    rows = [row for row in csv.DictReader(TABLE.open()) if row["run"] not in {run.name for run in runs}]
+    stored = csv.DictReader(TABLE.read_text().splitlines())
+    rows = [row for row in stored if row["run"] not in {run.name for run in runs}]
     rows += (dict(zip(COLUMNS, row, strict=True)) for run in runs for row in rows_of(run))
     rows.sort(key=lambda row: row["run"])
     with TABLE.open("w") as file:
@@ -42,9 +43,8 @@ def main(outputs: Sequence[Path]) -> None:
 
     figure = Figure(figsize=(11, 4.5), dpi=100, layout="constrained")
     by_steps, by_hours = figure.subplots(1, 2, sharey=True)
-    for colour, (name, points) in zip(
-        (VERMILLION, BLUE, GREEN), groupby(rows, key=lambda row: row["run"]), strict=False
-    ):
+    lines = groupby(rows, key=lambda row: row["run"])
+    for colour, (name, points) in zip(cycle((VERMILLION, BLUE, GREEN)), lines, strict=False):
         of_run = list(points)
         evaluated = [row for row in of_run if row["evaluation"]]
         for axes, key, unit in ((by_steps, "step", 1e6), (by_hours, "hours", 1)):

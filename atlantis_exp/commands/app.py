@@ -57,7 +57,7 @@ OmegaConf.register_new_resolver("help", _help, replace=True)
 OmegaConf.register_new_resolver("ray_object_store", lambda address: None if address else 78_643_200, replace=True)
 # The head that an objective needs, unless a person asks for another.
 OmegaConf.register_new_resolver(
-    "head_for", lambda objective: "quantile" if objective.endswith("quantile") else "plain", replace=True
+    "head_for", lambda objective, other="plain": "quantile" if objective.endswith("quantile") else other, replace=True
 )
 
 

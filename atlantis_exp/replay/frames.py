@@ -85,22 +85,22 @@ class FrameStore:
         size = self.frame_bytes
         frames = np.empty((*ids.shape, *self.frame_shape), np.uint8)
         target = frames.reshape(-1).data
-        for i, data in enumerate(self._encoded(ids.ravel())):
+        for i, (start, stop) in enumerate(self._spans(ids.ravel()).tolist()):
+            data = self._buffer[start:stop]
             target[i * size : (i + 1) * size] = lz4.block.decompress(data, uncompressed_size=size, dict=self.dictionary)
         return frames
 
     def segment(self, first_id: int) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint8]]:
         """Return the encoded frames since the stored `first_id`: their lengths in bytes, and the bytes in one piece."""
-        slots = np.arange(first_id, self.next_id) % self.capacity
-        lengths = self._lengths[slots]
-        spans = np.stack((self._starts[slots], self._starts[slots] + lengths), axis=1)
+        ids = np.arange(first_id, self.next_id)
+        spans = self._spans(ids)
         wraps = np.flatnonzero(spans[1:, 0] != spans[:-1, 1]) + 1
         # Whole stretches of the ring: an object for every frame keeps the garbage collector busy for seconds.
         stretches = (self._buffer[span[0, 0] : span[-1, 1]] for span in np.split(spans, wraps) if len(span))
-        return lengths, np.frombuffer(bytearray().join(stretches), np.uint8)
+        return self._lengths[ids % self.capacity], np.frombuffer(bytearray().join(stretches), np.uint8)
 
-    def _encoded(self, ids: npt.NDArray[np.int64]) -> list[memoryview]:
+    def _spans(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Return where the frames of stored `ids` begin and end in the buffer, (N, 2)."""
         slots = ids % self.capacity
         starts = self._starts[slots]
-        stops = starts + self._lengths[slots]
-        return [self._buffer[start:stop] for start, stop in zip(starts.tolist(), stops.tolist(), strict=True)]
+        return np.stack((starts, starts + self._lengths[slots]), axis=1)
