@@ -92,8 +92,11 @@ class Learner:
             weights = np.ones(len(a_t), np.float32)
         parts = self._in_shards(partial(self._gradients, len(a_t)), s_t, a_t, r_t, s_tpm, discount, weights)
         gradients, means, errors = zip(*parts, strict=True)
-        for parameter, first, *others in zip(self.network.parameters(), *gradients, strict=True):
-            parameter.grad = sum(others, first.float())
+        total, *others = gradients
+        for other in others:
+            torch._foreach_add_(total, other)
+        for parameter, gradient in zip(self.network.parameters(), total, strict=True):
+            parameter.grad = gradient
         self._measure(torch.stack(means).sum(0))
         self.optimizer.step()
         self._online.refresh()
@@ -112,8 +115,9 @@ class Learner:
         s_tpm: npt.NDArray[np.uint8],
         discount: npt.NDArray[np.floating],
         weights: npt.NDArray[np.floating],
-    ) -> tuple[list[torch.Tensor | None], torch.Tensor, torch.Tensor]:
-        """Return a shard's part of the batch's gradients, of its mean loss, value and target, and of its errors."""
+    ) -> tuple[list[torch.Tensor], torch.Tensor, torch.Tensor]:
+        """Return a shard's part of the batch's gradients, in float32, of its mean loss, value and target, and of its
+        errors."""
         online, target_network = self._online.networks[shard], self._target.networks[shard]
         actions = torch.as_tensor(a_t, dtype=torch.int64, device=self.device)
         rewards = torch.as_tensor(r_t, dtype=torch.float32, device=self.device)
@@ -130,7 +134,7 @@ class Learner:
         loss = (losses * torch.as_tensor(weights, dtype=torch.float32, device=self.device)).sum() / batch_size
         online.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        gradients = [parameter.grad for parameter in online.parameters()]
+        gradients = [parameter.grad.float() for parameter in online.parameters() if parameter.grad is not None]
         q, share = q.detach(), len(a_t) / batch_size
         means = torch.stack((loss.detach(), share * q.mean(), share * target.mean()))
         return gradients, means, td_errors(q, actions, target)

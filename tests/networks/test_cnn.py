@@ -14,6 +14,7 @@ def test_the_layers_are_those_of_figure_2_1() -> None:
         "Conv2d(32, 64, kernel_size=(4, 4), stride=(2, 2))",
         "ReLU()",
         "Conv2d(64, 64, kernel_size=(3, 3), stride=(1, 1))",
+        "Flatten(start_dim=1, end_dim=-1)",
         "ReLU()",
         "Linear(in_features=3136, out_features=512, bias=True)",
         "ReLU()",
@@ -30,7 +31,7 @@ def test_84_pixels_a_side_become_7_as_commented_in_figure_2_1() -> None:
         if isinstance(layer, nn.Conv2d):
             sides.append(x.shape[2])
     assert sides == [84, 20, 9, 7]
-    assert x.shape == (1, 64, 7, 7)
+    assert x.shape == (1, 64 * 7 * 7)
 
 
 def test_it_has_as_many_parameters_as_its_layers_add_up_to() -> None:
