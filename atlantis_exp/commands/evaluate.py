@@ -43,7 +43,8 @@ def evaluate(config: EvaluateConfig) -> None:
         source = {"weights": name, "sha256": card.sha256}
         protocol: dict[str, Any] = {
             key: getattr(card.evaluation, key)
-            for key in ("episodes", "epsilon", "seed")
+            # The environments, too: rounding depends on how many states a batch has, and a near tie on rounding.
+            for key in ("episodes", "epsilon", "seed", "num_envs")
             if not asked & {"evaluation", f"evaluation.{key}"}
         }
         settings = replace(settings, **protocol)

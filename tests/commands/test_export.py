@@ -65,17 +65,19 @@ def test_exported_weights_score_what_their_card_says(
     assert not any(str(trained) in path.read_text() for path in (folder / "README.md", folder / "card.json"))
 
     capsys.readouterr()
-    played = (f"weights={folder}", *outputs, "tracking=none", "evaluation.num_envs=2")
+    played = (f"weights={folder}", *outputs, "tracking=none")
     assert run(monkeypatch, evaluate, *played) == 0
     table = [[cell.strip() for cell in line.split("│")] for line in capsys.readouterr().out.splitlines()]
     rows = {row[1]: row[2:-1] for row in table if len(row) > 3}
     assert rows["card"] == rows["here"]
     assert rows["card"][-3:] == ["3", "0.9", "2000003"]
     (recorded,) = (trained / "evaluations").iterdir()
-    assert json.loads((recorded / "config.json").read_text())["sha256"] == card.sha256
+    facts = json.loads((recorded / "config.json").read_text())
+    assert (facts["sha256"], facts["evaluation"]["num_envs"]) == (card.sha256, 1)
     assert (recorded / "artifacts" / "best_episode.mp4").stat().st_size > 1_000
 
     for asked, protocol in (
+        (("evaluation.num_envs=2", "evaluation.video=false"), ["3", "0.9", "2000003"]),
         (("episodes=1", "evaluation.video=false"), ["1", "0.9", "2000003"]),
         (("evaluation=quick", "episodes=1", "evaluation.video=false"), ["1", "0.05", "1000003"]),
     ):
