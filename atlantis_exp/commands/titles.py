@@ -40,10 +40,10 @@ def _words(config: Config) -> tuple[list[str], list[str]]:
     named = {group: getattr(config, group).name for group in _NAMED}
     choices = (f"env={env}", *(f"{group}={option}" for group, option in named.items()))
     leaves = _leaves(config)
-    # The first of the nearest: no preset goes before any that is as near.
+    # No preset goes before any that is as near, and a later rung before the earlier one that has its options here.
     preset, differing = min(
-        ((name, _differing(leaves, _preset(name, choices))) for name in _presets(**named)),
-        key=lambda candidate: len(candidate[1]),
+        ((name, _differing(leaves, _preset(name, choices))) for name in reversed(_presets(**named))),
+        key=lambda candidate: (len(candidate[1]), candidate[0] != "none"),
     )
     words += [preset] if preset != "none" else []
     if len(differing) > _SPELLED:

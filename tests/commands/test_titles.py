@@ -21,6 +21,7 @@ TITLES = {
     "experiment=quick": "cnn uniform s0 quick",
     "experiment=paper_resnet seed=2": "resnet uniform top_half s2 paper_resnet",
     "experiment=ablation_05_n_step": "cnn uniform s0 adam linear_steps ablation_05_n_step",
+    "experiment=ablation_09_quantile": "cnn uniform s0 quantile adam linear_steps ablation_09_quantile",
     "experiment=ablation_08_dueling": "cnn uniform s0 double_dqn adam linear_steps ablation_08_dueling",
     "experiment=fast objective=dqn objective.n_step=3": "cnn uniform s0 adam linear_steps fast n_step=3",
     "env=atlantis_v5": "cnn uniform s0 atlantis_v5",
