@@ -288,13 +288,16 @@ def test_a_name_is_one_searchs(searching: Searching) -> None:
 
 
 def test_at_the_end_of_its_time_a_search_leaves_its_trial_to_be_continued(searching: Searching) -> None:
-    config, fixed = searching("budget.wall_clock=2s", "phase.quick.steps=100_000")
-    with pytest.raises(
-        Fault, match="the search goes on with: python -m atlantis_exp search experiment=quick"
-    ) as caught:
-        search(config, SPACE, fixed)
-    assert caught.value.exit_code == 124
-    session = _open(config, SPACE, fixed)
+    for seconds in (2, 8, 32):  # which can be over before a first trial, where other programs want the machine
+        config, fixed = searching(f"budget.wall_clock={seconds}s", "phase.quick.steps=100_000")
+        with pytest.raises(
+            Fault, match="the search goes on with: python -m atlantis_exp search experiment=quick"
+        ) as caught:
+            search(config, SPACE, fixed)
+        assert caught.value.exit_code == 124
+        session = _open(config, SPACE, fixed)
+        if session.trials:
+            break
     assert [trial.state.name for trial in session.trials] == ["RUNNING"]
     assert RunFolder(Path(config.paths.outputs) / "runs" / session.trials[0].user_attrs["run"]).state == "interrupted"
     commit = read_commit(session.folder.path)
