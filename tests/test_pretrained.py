@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from atlantis_exp import build
 from atlantis_exp.commands.cards import MOST_BYTES, build_exported_actor, read_card
 from atlantis_exp.training.actor import EpsilonGreedy
 
@@ -23,3 +24,18 @@ def test_a_folder_is_what_its_card_says(folder: Path) -> None:
     values = actor.q_values(np.zeros((2, env.stack, env.size, env.size), np.uint8))
     assert values.shape == (2, 4)
     assert np.isfinite(values).all()
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_a_folder_plays_alike_on_any_number_of_cores(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bit for bit: between two actions of nearly the same worth a rounding decides, and then the game is another."""
+    card, weights = read_card(folder)
+    env = card.config.env
+    states = np.random.default_rng(0).integers(0, 256, (40, env.stack, env.size, env.size), np.uint8)
+    values = []
+    for cores in (1, 3):
+        monkeypatch.setattr(build, "_THREADS", cores)
+        actor = build_exported_actor(card.config, weights, "cpu")
+        assert isinstance(actor, EpsilonGreedy)
+        values.append(actor.q_values(states))
+    np.testing.assert_array_equal(values[0], values[1])

@@ -88,8 +88,12 @@ def portable(config: Config) -> Config:
 
 
 def build_exported_actor(config: Config, weights: bytes, device: str) -> Actor:
-    """The player of exported weights; in float32, so that it is the same on every machine. Raises: Fault."""
-    return build_network_actor(replace(config, training=replace(config.training, precision="fp32")), weights, device)
+    """The player of exported weights; in float32 and on one thread, since rounding depends on how a batch is cut.
+
+    Raises: Fault.
+    """
+    exact = replace(config, threads=1, training=replace(config.training, precision="fp32"))
+    return build_network_actor(exact, weights, device)
 
 
 def beside(card: CardConfig, settings: EvaluationConfig, scores: Sequence[float]) -> Table:
