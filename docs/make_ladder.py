@@ -1,0 +1,124 @@
+"""Draw `docs/images/ladder.png` from `docs/data/ladder.csv` and print the table of docs/results.md.
+
+`python docs/make_ladder.py [OUTPUTS...]`, from the root of the checkout. The finished trainings in the folders OUTPUTS
+enter the data first, in the place of what it has of runs of the same names.
+"""
+
+import csv
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from atlantis_exp.commands.runs import RunFolder, all_runs
+from atlantis_exp.media import GREY
+from atlantis_exp.statistics import interquartile_mean, interval, resample
+from atlantis_exp.tracking.journal import Tags, curve, read
+
+DATA = Path("docs/data/ladder.csv")
+COLUMNS = ("run", "command", "commit", "updates", "hours", "steps", "training", "evaluation")
+EVERY = 5_000  # steps between two points of a curve
+RANDOM = 20_873  # a random player's mean (docs/reproduction.md)
+# What is said once, above the table.
+COMMON = ("seed=", "threads=", "env.workers=", "phase=brief", "evaluation.")
+
+Row = dict[str, str]
+
+
+def main(outputs: Sequence[Path]) -> None:
+    """Bring the data up to date, draw it, and print every run's mean with its interval."""
+    runs = [run for folder in outputs for run in all_runs(folder) if run.result]
+    rows = [] if not DATA.exists() else list(csv.DictReader(DATA.read_text().splitlines()))
+    rows = [row for row in rows if row["run"] not in {run.name for run in runs}] + [row_of(run) for run in runs]
+    rows.sort(key=lambda row: (label(row), row["run"]))
+    with DATA.open("w") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    ladder = [row for row in rows if "experiment=ablation" in row["command"]]
+    draw(ladder, [row for row in rows if row not in ladder])
+    for row in rows:
+        scores, (low, high) = estimates(row)
+        print(
+            f"| `{label(row)}` | {scores.mean():,.0f} | {low:,.0f} to {high:,.0f} | {interquartile_mean(scores):,.0f} "
+            f"| {numbers(row['training'])[-1]:,.0f} | {int(row['updates']):,} | {float(row['hours']):.2f} |"
+        )
+
+
+def row_of(run: RunFolder) -> Row:
+    """A finished training: what it was asked, what it took, its curve and every evaluated score."""
+    assert run.result is not None
+    tags = {
+        key: value for _, record in read(run.path) if isinstance(record, Tags) for key, value in record.values.items()
+    }
+    points: dict[int, float] = {}
+    for record in curve(run.path, ("score/mean_20",)):
+        points.setdefault(record.step // EVERY * EVERY, record.values["score/mean_20"])
+    with (run.path / f"artifacts/evaluation/{run.result.steps:09d}.csv").open() as file:
+        scores = [f"{float(episode['score']):.0f}" for episode in csv.DictReader(file)]
+    values = (
+        run.name,
+        tags["command"].removeprefix("python -m atlantis_exp "),
+        tags["git.commit"][:7],
+        f"{run.result.counts['updates']:.0f}",
+        f"{run.result.counts['hours']:.3f}",
+        " ".join(str(step) for step in points),
+        " ".join(f"{score:.0f}" for score in points.values()),
+        " ".join(scores),
+    )
+    return dict(zip(COLUMNS, values, strict=True))
+
+
+def label(row: Row) -> str:
+    """What sets a run's command apart."""
+    words = [word for word in row["command"].split() if not word.startswith(COMMON)]
+    return " ".join(words).removeprefix("experiment=").removeprefix("ablation_")
+
+
+def numbers(text: str) -> npt.NDArray[np.float64]:
+    return np.array(text.split(), np.float64)
+
+
+def estimates(row: Row) -> tuple[npt.NDArray[np.float64], tuple[float, float]]:
+    """The evaluated scores, and the 95 % interval of their mean over episodes."""
+    scores = numbers(row["evaluation"])
+    low, high = interval([sample.mean() for sample in resample([scores], 2_000, np.random.default_rng(0))])
+    return scores, (float(low), float(high))
+
+
+def draw(ladder: Sequence[Row], branches: Sequence[Row]) -> None:
+    """Curves of the rungs and of the branches, and the means of all."""
+    figure = Figure(figsize=(13, 5), dpi=100, layout="constrained")
+    panels = figure.subplots(1, 3, width_ratios=(1, 1, 1.2))
+    means = panels[2]
+    position = 0
+    for axes, rows, name, heading in (
+        (panels[0], ladder, "viridis_r", "from the report's recipe ..."),
+        (panels[1], branches, "plasma", "... and from experiment=fast"),
+    ):
+        colours = matplotlib.colormaps[name](np.linspace(0.05, 0.9, len(rows)))
+        for row, colour in zip(rows, colours, strict=True):
+            axes.plot(
+                numbers(row["steps"]) / 1e3, numbers(row["training"]), color=colour, linewidth=1, label=label(row)
+            )
+            scores, (low, high) = estimates(row)
+            means.plot([low, high], [position, position], color=colour, linewidth=4, solid_capstyle="butt", alpha=0.5)
+            means.plot(scores.mean(), position, "o", color=colour)
+            means.text(high, position, f"  {label(row)}", va="center", fontsize="small")
+            position -= 1
+        axes.set(xlabel="thousand steps", title=heading, ylim=(0, None))
+        axes.axhline(RANDOM, color=GREY, linestyle=":", linewidth=1)
+        axes.legend(frameon=False, fontsize="x-small")
+    panels[0].set(ylabel="training score, mean of 20 episodes")
+    means.set(title="evaluation, mean and 95 % over episodes", xlabel="score", yticks=[])
+    means.set(xlim=(0, 2 * means.get_xlim()[1]))
+    means.axvline(RANDOM, color=GREY, linestyle=":", linewidth=1)
+    figure.savefig("docs/images/ladder.png")
+
+
+if __name__ == "__main__":
+    main([Path(argument) for argument in sys.argv[1:]])
