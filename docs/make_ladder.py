@@ -32,8 +32,8 @@ Row = dict[str, str]
 def main(outputs: Sequence[Path]) -> None:
     """Bring the data up to date, draw it, and print every run's mean with its interval."""
     runs = [run for folder in outputs for run in all_runs(folder) if run.result]
-    rows = [] if not DATA.exists() else list(csv.DictReader(DATA.read_text().splitlines()))
-    rows = [row for row in rows if row["run"] not in {run.name for run in runs}] + [row_of(run) for run in runs]
+    stored = csv.DictReader(DATA.read_text().splitlines())
+    rows = [row for row in stored if row["run"] not in {run.name for run in runs}] + [row_of(run) for run in runs]
     rows.sort(key=lambda row: (label(row), row["run"]))
     with DATA.open("w") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
