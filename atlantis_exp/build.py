@@ -6,6 +6,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -181,7 +182,15 @@ def build_learner(config: cfg.Config) -> Learner:
         precision=choose_precision(config.training.precision, device),  # type: ignore[arg-type]
         target_mode=target.mode,
         shards=shards,
+        compile=_compiled if config.compile else lambda network: network,
     )
+
+
+def _compiled(network: nn.Module) -> nn.Module:
+    """A faster module of the same weights for batches of one size; on a GPU with CUDA graphs, which start all kernels
+    at once."""
+    on_gpu = next(network.parameters()).is_cuda
+    return cast(nn.Module, torch.compile(network, dynamic=False, mode="reduce-overhead" if on_gpu else None))
 
 
 def build_schedule(schedule: cfg.EpsilonConfig | cfg.LrScheduleConfig) -> Schedule:
@@ -198,7 +207,7 @@ def count_update_flops(config: cfg.Config) -> int:
     Counted on a learner of its own: forward, backward and the objective's passes, whatever they are.
     """
     threads = torch.get_num_threads()
-    learner = build_learner(dataclasses.replace(config, threads=1))  # the counter sees this thread alone
+    learner = build_learner(dataclasses.replace(config, threads=1, compile=False))  # the counter sees this thread alone
     states = np.zeros((2, config.env.stack, config.env.size, config.env.size), np.uint8)
     with FlopCounterMode(display=False) as counter:
         learner.update(states, np.zeros(2, np.int64), np.zeros(2), states, np.zeros(2))

@@ -340,6 +340,7 @@ class Config:
     resume: Literal["auto", "never", "must"]
     device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
     threads: Annotated[int, Field(ge=1, le=256)] | None
+    compile: bool = False  # as in runs and cards from before there was the key
     training: TrainingConfig
     replay: ReplayConfig
     env: EnvConfig
@@ -400,7 +401,7 @@ class Config:
     def science(self) -> dict[str, Any]:
         """What decides the run's numbers: all but tracking, budget, places, devices and process counts."""
         tree = to_dict(self)
-        for key in ("resume", "device", "threads", "tracking", "budget", "paths", "samplers", "sampler"):
+        for key in ("resume", "device", "threads", "compile", "tracking", "budget", "paths", "samplers", "sampler"):
             del tree[key]
         del tree["env"]["workers"]
         # A list, since the order of phases counts and their names do not.

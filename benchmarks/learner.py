@@ -7,7 +7,6 @@ multiplication of square matrices in the same number format, right before it in 
 """
 
 import argparse
-import functools
 import statistics
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -50,14 +49,14 @@ def update_of(config: Config) -> Callable[[], object]:
     # As the replay memory hands them over: frame by frame, seen as state by state.
     frames = rng.integers(0, 256, (config.env.stack + 1, batch_size, config.env.size, config.env.size), np.uint8)
     states = frames.swapaxes(0, 1)
-    return functools.partial(
-        learner.update,
+    batch = (
         states[:, :-1],
         rng.integers(4, size=batch_size),
         np.zeros(batch_size, np.float32),
         states[:, 1:],
         np.full(batch_size, config.objective.gamma, np.float32),
     )
+    return lambda: learner.update(*batch).cpu()  # waits for a GPU
 
 
 def gemm_of(precision: str) -> Callable[[], None]:

@@ -87,7 +87,7 @@ def changed(tree: Tree, key: str, value: Any) -> Tree:
 def is_scientific(key: str) -> bool:
     """Whether a key decides the run's numbers."""
     group = key.split(".")[0]
-    free = {"resume", "device", "threads", "tracking", "budget", "paths"}
+    free = {"resume", "device", "threads", "compile", "tracking", "budget", "paths"}
     return group not in free and key != "env.workers"
 
 

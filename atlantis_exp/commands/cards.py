@@ -81,6 +81,7 @@ def portable(config: Config) -> Config:
         resume="auto",
         device="auto",
         threads=None,
+        compile=False,
         env=replace(config.env, workers=None),
         tracking=replace(config.tracking, uri=None),
         paths=PathsConfig(outputs="outputs"),

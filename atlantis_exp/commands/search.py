@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from atlantis_exp.training.trainer import Trainer
 
 _OWN = {field.name for field in dataclasses.fields(SearchConfig)} - {field.name for field in dataclasses.fields(Config)}
-_CLOSED = _OWN | {"seed", "resume", "device", "threads", "evaluation", "tracking", "budget", "paths"}
+_CLOSED = _OWN | {"seed", "resume", "device", "threads", "compile", "evaluation", "tracking", "budget", "paths"}
 _WAIT_SECONDS = 2.0  # between two looks at the trials of other processes
 _SHOWN = 10  # trials in the table at the end
 _STATES = {"COMPLETE": "done", "FAIL": "failed"}  # Optuna's words in ours

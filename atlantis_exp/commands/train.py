@@ -201,6 +201,9 @@ def _train(
                 journal.status("FAILED", str(error) or type(error).__name__)
             if isinstance(error, WorkerDied | CheckpointError | Diverged | OSError | JournalError):
                 raise Fault(f"run {folder.name}: {error}; continue with: {command}") from error
+            if config.compile and _is_of_compilation(error):
+                reason = str(error).strip().partition("\n")[0]
+                raise Fault(f"run {folder.name}: torch.compile failed, {reason}; compile=false does without") from error
             raise
         finally:
             progress.close()
@@ -232,6 +235,12 @@ def _check_forecast(config: Config, steps_done: int, progress: "Progress") -> No
         if config.budget.forecast == "refuse":
             raise Fault(f"{forecast.shortage}; budget.forecast=warn starts all the same")
         progress.say(f"warning: {forecast.shortage}")
+
+
+def _is_of_compilation(error: BaseException) -> bool:
+    from torch._dynamo.exc import TorchDynamoException  # takes a second to import
+
+    return isinstance(error, TorchDynamoException)
 
 
 def _facts(trainer: "Trainer") -> dict[str, str]:

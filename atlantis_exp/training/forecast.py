@@ -95,7 +95,7 @@ def forecast(
 
     def update() -> None:
         ids, weights = sampler.sample(memory, plan.batch_size, rng)
-        learner.update(*memory.gather(ids, plan.returns), weights)
+        learner.update(*memory.gather(ids, plan.returns), weights).cpu()  # waits for a GPU
 
     update_seconds = _median_seconds(update, at_least=3, seconds=1.0)
 

@@ -471,6 +471,22 @@ def test_a_training_killed_twenty_times_is_the_unbroken_one_and_mlflow_has_each_
 
 
 @pytest.mark.slow
+def test_a_machine_that_cannot_compile_is_told_in_one_line(tiny_overrides: tuple[str, ...], tmp_path: Path) -> None:
+    done = subprocess.run(
+        (*COMMAND, *tiny_overrides, "compile=true", f"paths.outputs={tmp_path}"),
+        cwd=REPOSITORY,
+        env={**os.environ, "CXX": str(tmp_path / "none"), "TORCHINDUCTOR_FORCE_DISABLE_CACHES": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert "torch.compile failed, InvalidCxxCompiler" in done.stderr.splitlines()[-1]
+    assert done.stderr.splitlines()[-1].endswith("compile=false does without")
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
 def test_verify_resume_records_its_verdict(tiny_overrides: tuple[str, ...], tmp_path: Path) -> None:
     overrides = (*tiny_overrides, "phase.quick.steps=4_000", "evaluation.every_steps=null", f"paths.outputs={tmp_path}")
     done = subprocess.run(

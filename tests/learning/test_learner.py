@@ -1,7 +1,7 @@
 import copy
 import json
 from collections.abc import Callable, Iterator
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -9,6 +9,7 @@ import pytest
 import torch
 from safetensors.torch import load, save
 from torch import nn
+from torch._dynamo.testing import CompileCounterWithBackend
 from torch.nn.functional import smooth_l1_loss
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -53,6 +54,10 @@ def _networks(network_class: type[nn.Module], seed: int = 0) -> tuple[nn.Module,
     return network, target
 
 
+def _as_it_is(network: nn.Module) -> nn.Module:
+    return network
+
+
 def _learner(
     network_class: type[nn.Module],
     *,
@@ -62,11 +67,20 @@ def _learner(
     precision: Precision = "fp32",
     target_mode: Literal["eval", "train"] = "eval",
     shards: int = 1,
+    compile: Callable[[nn.Module], nn.Module] = _as_it_is,
 ) -> Learner:
     network, target = _networks(network_class, seed)
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, fused=True)
     return Learner(
-        network, target, optimizer, objective, tau, precision=precision, target_mode=target_mode, shards=shards
+        network,
+        target,
+        optimizer,
+        objective,
+        tau,
+        precision=precision,
+        target_mode=target_mode,
+        shards=shards,
+        compile=compile,
     )
 
 
@@ -238,6 +252,29 @@ def test_shards_leave_no_bit_to_chance(precision: Precision) -> None:
 def test_a_network_whose_samples_meet_is_not_split() -> None:
     with pytest.raises(ValueError, match="batch statistics"):
         _learner(ResNetDQN, shards=2)
+
+
+# Compilation
+
+
+@every_network
+def test_a_compiled_learner_learns_the_same(network_class: type[nn.Module]) -> None:
+    """By a backend that needs no compiler; dropout masks are drawn from the same generators."""
+    backend = CompileCounterWithBackend("aot_eager")
+    shards = 2 if network_class is DQNCnn else 1
+
+    def compile(network: nn.Module) -> nn.Module:
+        return cast(nn.Module, torch.compile(network, backend=backend, dynamic=False))
+
+    plain = _learner(network_class, precision="bf16", shards=shards)
+    compiled = _learner(network_class, precision="bf16", shards=shards, compile=compile)
+    for seed in range(3):
+        batch = _batch(_SIDE[network_class], seed)
+        np.testing.assert_allclose(plain.q_values(batch[0]), compiled.q_values(batch[0]), rtol=1e-3, atol=1e-5)
+        errors = plain.update(*batch), compiled.update(*batch)
+        torch.testing.assert_close(*errors, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(plain.state_dict(), compiled.state_dict(), rtol=1e-3, atol=1e-5)
+    assert backend.frame_count >= 2 * shards  # online and target network of each
 
 
 # The soft update

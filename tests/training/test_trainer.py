@@ -2,6 +2,7 @@ import csv
 import dataclasses
 import io
 import itertools
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -102,6 +103,10 @@ def test_the_same_seed_gives_the_same_training_and_another_seed_another(
         ),
         pytest.param(("model=resnet", "env.size=16", "env.num_envs=8", "env.workers=2"), marks=pytest.mark.slow),
         pytest.param(("model=cnn", "env.num_envs=8", "env=atlantis_standard", "env.size=40"), marks=pytest.mark.slow),
+        pytest.param(
+            ("model=cnn", "env.num_envs=3", "env.workers=2", "compile=true"),
+            marks=[pytest.mark.slow, pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs it")],
+        ),
     ],
 )
 def test_a_training_killed_in_every_phase_is_the_unbroken_one_bit_for_bit(
