@@ -182,6 +182,7 @@ def build_learner(config: cfg.Config) -> Learner:
         precision=choose_precision(config.training.precision, device),  # type: ignore[arg-type]
         target_mode=target.mode,
         shards=shards,
+        ema=config.training.ema,
         compile=_compiled if config.compile else lambda network: network,
     )
 
@@ -308,7 +309,8 @@ def stored_weights(config: cfg.Config, folder: Path, weights: str) -> tuple[byte
             raise Fault(f"run {folder.name} has neither a checkpoint nor an evaluation yet")
         return (folder / "artifacts" / stored[-1].path).read_bytes(), stored[-1].step
     if weights == "latest":
-        return safetensors.torch.save(state["learner"]["network"]), int(state["counters"]["steps"])
+        learner = state["learner"]
+        return safetensors.torch.save(learner.get("evaluated", learner["network"])), int(state["counters"]["steps"])
     path = folder / "artifacts" / "best.safetensors"
     if not path.exists():
         raise Fault(f"run {folder.name} has no evaluation yet, so no best weights; weights=latest has some")
@@ -363,7 +365,7 @@ def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: 
     env = config.env
     learner = build_learner(config)
     actor = EpsilonGreedy(learner.q_values, len(ACTIONS))
-    watched = EpsilonGreedy(learner.q_values, len(ACTIONS), watches=True)
+    watched = EpsilonGreedy(learner.evaluated_q_values, len(ACTIONS), watches=True)
     evaluation: Evaluate = partial(run_evaluation, watched, env, config.evaluation)
     return Trainer(
         plan=build_plan(config),

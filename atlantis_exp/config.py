@@ -258,6 +258,7 @@ class TrainingConfig:
     learn_start: Annotated[int, Field(ge=0)]  # transitions in the memory
     batch_size: Count  # transitions
     precision: Literal["auto", "fp32", "bf16"]
+    ema: Annotated[int, Field(ge=10)] | None = None  # updates over which evaluated weights are averaged; null: latest
 
 
 @dataclass(config=_STRICT, kw_only=True, frozen=True)
@@ -404,6 +405,8 @@ class Config:
         for key in ("resume", "device", "threads", "compile", "tracking", "budget", "paths", "samplers", "sampler"):
             del tree[key]
         del tree["env"]["workers"]
+        if tree["training"]["ema"] is None:  # a run from before there was the key stays itself
+            del tree["training"]["ema"]
         # A list, since the order of phases counts and their names do not.
         tree["phase"] = [{**phase, "sampler": to_dict(self.sampler_of(name))} for name, phase in tree["phase"].items()]
         return tree

@@ -7,11 +7,14 @@ from typing import Any
 
 import pytest
 import safetensors.torch
+import torch
 
 from atlantis_exp.build import count_update_flops, stored_weights
 from atlantis_exp.commands.train import train
 from atlantis_exp.config import Config
 from atlantis_exp.faults import Fault
+from atlantis_exp.game.emulator import ACTIONS
+from atlantis_exp.training.trainer import Trainer
 
 
 def test_the_operations_of_an_update_are_those_counted_by_hand(tiny: Callable[..., Config]) -> None:
@@ -46,3 +49,21 @@ def test_a_run_without_checkpoints_plays_from_the_weights_of_its_evaluations(tin
     shutil.rmtree(folder)
     with pytest.raises(Fault, match="neither a checkpoint nor an evaluation"):
         stored("latest")
+
+
+def test_with_an_average_it_is_what_is_evaluated_and_stored(
+    tiny: Callable[..., Config], started: Callable[[Config, Path], Trainer], tmp_path: Path
+) -> None:
+    """The network holds one action, its average another."""
+    config = tiny("training.ema=10", "evaluation.epsilon=0", "budget.steps=1")
+    trainer = started(config, tmp_path)
+    learner = trainer.learner
+    for network, action in ((learner.network, "RIGHTFIRE"), (learner.evaluated, "FIRE")):
+        with torch.no_grad():
+            [*network.parameters()][-1][ACTIONS.index(action)] += 1_000
+    trainer.run()
+    assert trainer.last_metrics["actions/FIRE"] == 1
+    average = safetensors.torch.save(learner.evaluated.state_dict())
+    assert average != safetensors.torch.save(learner.network.state_dict())
+    for weights in ("latest", "best"):
+        assert stored_weights(config, tmp_path, weights) == (average, 1)

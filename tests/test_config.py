@@ -58,7 +58,7 @@ RUNGS = {  # of the ladder from the report's recipe to experiment=fast: the keys
 LAST_RUNGS = {  # from the report's head and objective to those of experiment=fast
     "ablation_09_quantile": {"objective.name", "objective.quantiles", "model.head"},
     "ablation_10_life_loss": {"objective.terminal_on_life_loss"},
-    "fast": {"env.crop"},
+    "fast": {"env.crop", "training.ema"},  # the second changes who is evaluated, and no training
 }
 
 
@@ -101,6 +101,7 @@ def another(key: str, value: Any) -> Any:
         "objective.target.start": ("copy", "independent"),
         "optimizer.name": ("adam", "adamw"),
         "training.precision": ("fp32", "bf16"),
+        "training.ema": (100, 200),
         "env.max_pool": (False,) if value else (True,),
         "env.crop": ([0, 160, 210, 0], [16, 160, 96, 0]),
         "env.frameskip": (4, 3),

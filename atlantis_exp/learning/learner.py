@@ -15,6 +15,7 @@ from torch import nn
 from atlantis_exp.learning.objectives import Objective, action_values, td_errors
 
 _MEASURES = ("loss", "q", "target", "gradient_norm")
+_AVERAGE_EVERY = 10  # updates, since an average of weights moves as much memory as the optimizer does
 
 T = TypeVar("T")
 
@@ -37,6 +38,9 @@ class Learner:
     report leaves it in train mode (dropout and batch statistics in its targets) and moves its parameters alone:
     target_mode "train".
 
+    Whoever evaluates asks `evaluated`: the network, or with `ema` a mean of its weights over about as many updates, an
+    exponential moving average that learning and acting know nothing of.
+
     Statistics gather on the device: `update` never waits for it, and a GPU is sent batches from pinned memory.
 
     compile: what makes faster modules of both networks for updates, as torch.compile does; acting goes without, since
@@ -55,6 +59,7 @@ class Learner:
         precision: Literal["fp32", "bf16"] = "fp32",
         target_mode: Literal["eval", "train"] = "eval",
         shards: int = 1,
+        ema: int | None = None,
         compile: Callable[[nn.Module], nn.Module] = lambda network: network,
     ) -> None:
         self.network = network.eval()
@@ -69,6 +74,10 @@ class Learner:
         self.shards = shards
         self._online = _Replicas(network, self.dtype, shards)
         self._target = _Replicas(target, self.dtype, shards)
+        self.ema = ema  # updates
+        shared = {id(generator): generator for _, generator in _generators(network)}
+        self.evaluated = copy.deepcopy(network, shared) if ema else network
+        self._evaluated = _Replicas(self.evaluated, self.dtype, shards) if ema else self._online
         self._online_passes = [compile(replica) for replica in self._online.networks]
         self._target_passes = [compile(replica) for replica in self._target.networks]
         if shards > 1:
@@ -108,7 +117,13 @@ class Learner:
         self._online.refresh()
         self.updates += 1
         if self.updates % self.target_every == 0:
-            self._move_target()
+            _follow(self.target, self.network, self.tau, buffers=self.target_mode == "eval")
+            self._target.refresh()
+        if self.ema and self.updates % _AVERAGE_EVERY == 0:
+            # A plain mean of all weights so far, until there are as many as are asked for.
+            share = max(_AVERAGE_EVERY / self.updates, _AVERAGE_EVERY / self.ema)
+            _follow(self.evaluated, self.network, share, buffers=True)
+            self._evaluated.refresh()
         return torch.cat(errors)
 
     def _gradients(
@@ -146,11 +161,15 @@ class Learner:
 
     def q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
         """Return the network's values (B, A) of states (B, C, H, W) in 0..255; changes nothing."""
-        return np.concatenate(self._in_shards(self._values, states))
+        return np.concatenate(self._in_shards(partial(self._values, self._online), states))
+
+    def evaluated_q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+        """Return the values (B, A) of `evaluated` of states (B, C, H, W) in 0..255; changes nothing."""
+        return np.concatenate(self._in_shards(partial(self._values, self._evaluated), states))
 
     @torch.inference_mode()
-    def _values(self, shard: int, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
-        q = self._online.networks[shard](self._input(states)).float()
+    def _values(self, replicas: "_Replicas", shard: int, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+        q = replicas.networks[shard](self._input(states)).float()
         values: npt.NDArray[np.float32] = action_values(q).cpu().numpy()
         return values
 
@@ -207,6 +226,7 @@ class Learner:
             "sums": self._sums,
             "measured": self._measured,
             "first_nonfinite": self._first_nonfinite,
+            **({"evaluated": self.evaluated.state_dict()} if self.ema else {}),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -227,6 +247,9 @@ class Learner:
         self._sums.copy_(state["sums"])
         self._measured = state["measured"]
         self._first_nonfinite.copy_(state["first_nonfinite"])
+        if self.ema:
+            self.evaluated.load_state_dict(state["evaluated"])
+            self._evaluated.refresh()
         self._online.refresh()
         self._target.refresh()
 
@@ -250,17 +273,6 @@ class Learner:
         first = ~means[0].isfinite() & (self._first_nonfinite < 0)
         self._first_nonfinite.masked_fill_(first, self.updates)
 
-    @torch.no_grad()
-    def _move_target(self) -> None:
-        torch._foreach_lerp_(list(self.target.parameters()), list(self.network.parameters()), self.tau)
-        if self.target_mode == "eval":
-            for running, latest in zip(self.target.buffers(), self.network.buffers(), strict=True):
-                if running.is_floating_point():
-                    running.lerp_(latest, self.tau)
-                else:
-                    running.copy_(latest)
-        self._target.refresh()
-
     def _generators(self) -> dict[str, torch.Generator]:
         """Return the random streams of both networks."""
         return {
@@ -280,6 +292,18 @@ def _generators(network: nn.Module) -> Iterator[tuple[str, torch.Generator]]:
     for name, module in network.named_modules():
         if isinstance(generator := getattr(module, "generator", None), torch.Generator):
             yield name, generator
+
+
+@torch.no_grad()
+def _follow(follower: nn.Module, leader: nn.Module, share: float, *, buffers: bool) -> None:
+    """Move a network's parameters towards another's by a share of the way, and its buffers where asked."""
+    torch._foreach_lerp_(list(follower.parameters()), list(leader.parameters()), share)
+    if buffers:
+        for running, latest in zip(follower.buffers(), leader.buffers(), strict=True):
+            if running.is_floating_point():
+                running.lerp_(latest, share)
+            else:
+                running.copy_(latest)
 
 
 class _Replicas:

@@ -113,8 +113,8 @@ def forecast(
         steps=steps,
         memory=replay_bytes + _WARM_MEMORY,
         memory_available=psutil.virtual_memory().available,
-        # Two generations of both networks and two moments; weights of each evaluation, in the folder and in MLflow.
-        disk=int(replay_bytes + 8 * weights + 2 * evaluations * weights),
+        # Two generations of all networks and two moments; weights of each evaluation, in the folder and in MLflow.
+        disk=int(replay_bytes + (10 if learner.ema else 8) * weights + 2 * evaluations * weights),
         disk_available=shutil.disk_usage(_existing(outputs)).free,
     )
 

@@ -442,7 +442,7 @@ class Trainer:
         self.tracker.artifact(f"evaluation/{step:09d}.csv", evaluation.table().encode())
         self.tracker.artifact(f"evaluation/{step:09d}.txt", evaluation.report().encode())
         weights = safetensors.torch.save(
-            {name: tensor.contiguous() for name, tensor in self.learner.network.state_dict().items()}
+            {name: tensor.contiguous() for name, tensor in self.learner.evaluated.state_dict().items()}
         )
         results = {name: value for name, value in metrics.items() if name.startswith("evaluation/")}
         is_best = evaluation.summary.mean > self.best_mean

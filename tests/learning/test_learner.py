@@ -67,6 +67,7 @@ def _learner(
     precision: Precision = "fp32",
     target_mode: Literal["eval", "train"] = "eval",
     shards: int = 1,
+    ema: int | None = None,
     compile: Callable[[nn.Module], nn.Module] = _as_it_is,
 ) -> Learner:
     network, target = _networks(network_class, seed)
@@ -80,6 +81,7 @@ def _learner(
         precision=precision,
         target_mode=target_mode,
         shards=shards,
+        ema=ema,
         compile=compile,
     )
 
@@ -313,6 +315,51 @@ def test_a_target_in_train_mode_keeps_running_statistics_of_its_own() -> None:
     assert int(learner.target.get_buffer("block1.2.num_batches_tracked")) == 1
 
 
+# The average
+
+
+@every_network
+def test_the_evaluated_network_is_a_mean_of_all_weights_first_and_an_exponential_one_then(
+    network_class: type[nn.Module],
+) -> None:
+    learner = _learner(network_class, ema=40)
+    batch = _batch(_SIDE[network_class])
+    snapshots = []
+    for _ in range(7):
+        for _ in range(10):
+            learner.update(*batch)
+        snapshots.append(copy.deepcopy(learner.network.state_dict()))
+    for key, average in learner.evaluated.state_dict().items():
+        if not average.is_floating_point():
+            torch.testing.assert_close(average, snapshots[-1][key])
+            continue
+        expected = torch.stack([snapshot[key].double() for snapshot in snapshots[:4]]).mean(0)
+        for snapshot in snapshots[4:]:
+            expected = 0.75 * expected + 0.25 * snapshot[key].double()
+        torch.testing.assert_close(average.double(), expected, rtol=1e-5, atol=1e-7)
+
+
+@every_network
+@every_precision
+def test_an_average_changes_neither_learning_nor_acting(network_class: type[nn.Module], precision: Precision) -> None:
+    shards = 2 if network_class is DQNCnn else 1
+    plain, averaged = (_learner(network_class, precision=precision, shards=shards, ema=ema) for ema in (None, 20))
+    for seed in range(21):
+        batch = _batch(_SIDE[network_class], seed)
+        for learner in (plain, averaged):
+            learner.update(*batch)
+    np.testing.assert_array_equal(plain.q_values(batch[0]), averaged.q_values(batch[0]))
+    state = averaged.state_dict()
+    evaluated = state.pop("evaluated")
+    torch.testing.assert_close(state, plain.state_dict(), rtol=0, atol=0)
+
+    alone = _learner(network_class, precision=precision, shards=shards)
+    alone.load_state_dict({**plain.state_dict(), "network": evaluated})
+    np.testing.assert_array_equal(averaged.evaluated_q_values(batch[0]), alone.q_values(batch[0]))
+    assert not np.array_equal(averaged.evaluated_q_values(batch[0]), averaged.q_values(batch[0]))
+    np.testing.assert_array_equal(plain.evaluated_q_values(batch[0]), plain.q_values(batch[0]))
+
+
 # Acting
 
 
@@ -451,27 +498,29 @@ def test_the_first_loss_that_is_no_number_is_remembered(poison: float) -> None:
 @every_network
 @every_precision
 @pytest.mark.parametrize("target_mode", ["eval", "train"])
+@pytest.mark.parametrize("ema", [None, 15])
 def test_a_restored_learner_continues_bit_for_bit(
-    network_class: type[nn.Module], precision: Precision, target_mode: Literal["eval", "train"]
+    network_class: type[nn.Module], precision: Precision, target_mode: Literal["eval", "train"], ema: int | None
 ) -> None:
     def learner(seed: int) -> Learner:
         shards = 2 if network_class is DQNCnn else 1
-        return _learner(network_class, seed=seed, precision=precision, target_mode=target_mode, shards=shards)
+        return _learner(network_class, seed=seed, precision=precision, target_mode=target_mode, shards=shards, ema=ema)
 
-    batches = [_batch(_SIDE[network_class], seed) for seed in range(4)]
+    batches = [_batch(_SIDE[network_class], seed) for seed in range(22 if ema else 4)]
     unbroken, restored = learner(0), learner(10)
     unbroken.learning_rate = 3e-4
-    for batch in batches[:2]:
+    for batch in batches[:-2]:
         unbroken.update(*batch)
     saved = _through_disk(unbroken.state_dict())
     restored.load_state_dict(saved)
-    for batch in batches[2:]:
+    for batch in batches[-2:]:
         np.testing.assert_array_equal(unbroken.q_values(batch[0]), restored.q_values(batch[0]))
+        np.testing.assert_array_equal(unbroken.evaluated_q_values(batch[0]), restored.evaluated_q_values(batch[0]))
         unbroken.update(*batch)
         restored.update(*batch)
     torch.testing.assert_close(unbroken.state_dict(), restored.state_dict(), rtol=0, atol=0)
     assert unbroken.statistics() == restored.statistics()
-    assert restored.updates == 4
+    assert restored.updates == len(batches)
     assert restored.learning_rate == 3e-4
 
 
