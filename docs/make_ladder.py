@@ -92,7 +92,7 @@ def estimates(row: Row) -> tuple[npt.NDArray[np.float64], tuple[float, float]]:
 
 def draw(ladder: Sequence[Row], branches: Sequence[Row]) -> None:
     """Curves of the rungs and of the branches, and the means of all."""
-    figure = Figure(figsize=(13, 5), dpi=100, layout="constrained")
+    figure = Figure(figsize=(13, 6.5), dpi=100, layout="constrained")
     panels = figure.subplots(1, 3, width_ratios=(1, 1, 1.2))
     means = panels[2]
     position = 0
@@ -108,11 +108,11 @@ def draw(ladder: Sequence[Row], branches: Sequence[Row]) -> None:
             scores, (low, high) = estimates(row)
             means.plot([low, high], [position, position], color=colour, linewidth=4, solid_capstyle="butt", alpha=0.5)
             means.plot(scores.mean(), position, "o", color=colour)
-            means.text(high, position, f"  {label(row)}", va="center", fontsize="small")
+            means.text(high, position, f"  {label(row).removeprefix('fast ')}", va="center", fontsize="small")
             position -= 1
         axes.set(xlabel="thousand steps", title=heading, ylim=(0, None))
         axes.axhline(RANDOM, color=GREY, linestyle=":", linewidth=1)
-        axes.legend(frameon=False, fontsize="x-small")
+        axes.legend(frameon=False, fontsize="x-small", loc="upper center", bbox_to_anchor=(0.5, -0.11))
     panels[0].set(ylabel="training score, mean of 20 episodes")
     means.set(title="evaluation, mean and 95 % over episodes", xlabel="score", yticks=[])
     means.set(xlim=(0, 2 * means.get_xlim()[1]))
