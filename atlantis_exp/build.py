@@ -183,7 +183,7 @@ def build_learner(config: cfg.Config) -> Learner:
         target_mode=target.mode,
         shards=shards,
         ema=config.training.ema,
-        compile=_compiled if config.compile else lambda network: network,
+        compile=_compiled if config.compile else None,
     )
 
 
@@ -324,7 +324,7 @@ def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Acto
         Fault: where the weights are damaged or another network's.
     """
     try:
-        learner = build_learner(dataclasses.replace(config, device=device))
+        learner = build_learner(dataclasses.replace(config, device=device, compile=False))
         learner.load_state_dict({**learner.state_dict(), "network": safetensors.torch.load(weights)})
     except (SafetensorError, RuntimeError) as error:
         raise Fault(f"the weights are damaged or another network's: {' '.join(str(error).split())}") from error

@@ -13,6 +13,7 @@ import matplotlib
 import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
+from tables import RANDOM, Row, updated
 
 from atlantis_exp.commands.runs import RunFolder, all_runs
 from atlantis_exp.media import GREY
@@ -22,23 +23,14 @@ from atlantis_exp.tracking.journal import Tags, curve, read
 DATA = Path("docs/data/ladder.csv")
 COLUMNS = ("run", "command", "commit", "updates", "hours", "steps", "training", "evaluation")
 EVERY = 5_000  # steps between two points of a curve
-RANDOM = 20_873  # a random player's mean (docs/reproduction.md)
 # What is said once, above the table.
 COMMON = ("seed=", "threads=", "env.workers=", "phase=brief", "evaluation.")
-
-Row = dict[str, str]
 
 
 def main(outputs: Sequence[Path]) -> None:
     """Bring the data up to date, draw it, and print every run's mean with its interval."""
     runs = [run for folder in outputs for run in all_runs(folder) if run.result]
-    stored = csv.DictReader(DATA.read_text().splitlines())
-    rows = [row for row in stored if row["run"] not in {run.name for run in runs}] + [row_of(run) for run in runs]
-    rows.sort(key=lambda row: (label(row), row["run"]))
-    with DATA.open("w") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    rows = updated(DATA, COLUMNS, {run.name for run in runs}, map(row_of, runs), lambda row: (label(row), row["run"]))
     ladder = [row for row in rows if "experiment=ablation" in row["command"]]
     draw(ladder, [row for row in rows if row not in ladder])
     for row in rows:

@@ -4,13 +4,13 @@
 enter the table first, in the place of what it has of runs of the same names.
 """
 
-import csv
 import sys
 from collections.abc import Iterator, Sequence
 from itertools import cycle, groupby
 from pathlib import Path
 
 from matplotlib.figure import Figure
+from tables import RANDOM, updated
 
 from atlantis_exp.commands.runs import RunFolder, all_runs
 from atlantis_exp.media import BLUE, GREEN, GREY, VERMILLION
@@ -26,20 +26,13 @@ KEYS = {
 EVALUATION = "evaluation/mean"
 COLUMNS = ("run", "step", *KEYS, "evaluation")
 EVERY = 10_000  # steps between two rows of the table; evaluations have rows of their own
-RANDOM = 20_873  # a random player's mean (docs/reproduction.md)
 
 
 def main(outputs: Sequence[Path]) -> None:
     """Bring the table up to date and draw a line a run, with a point for each evaluation."""
     runs = [run for folder in outputs for run in all_runs(folder)]
-    stored = csv.DictReader(TABLE.read_text().splitlines())
-    rows = [row for row in stored if row["run"] not in {run.name for run in runs}]
-    rows += (dict(zip(COLUMNS, row, strict=True)) for run in runs for row in rows_of(run))
-    rows.sort(key=lambda row: row["run"])
-    with TABLE.open("w") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    new = (dict(zip(COLUMNS, row, strict=True)) for run in runs for row in rows_of(run))
+    rows = updated(TABLE, COLUMNS, {run.name for run in runs}, new, lambda row: (row["run"],))
 
     figure = Figure(figsize=(11, 4.5), dpi=100, layout="constrained")
     by_steps, by_hours = figure.subplots(1, 2, sharey=True)

@@ -202,6 +202,11 @@ def test_an_address_that_is_none_or_holds_a_password_is_refused_without_repeatin
     assert "secret" not in str(refused.value)
 
 
+def test_a_run_from_before_a_key_stays_itself() -> None:
+    """The name that commit 70f4df5, without `training.ema` and `compile`, gave to this run (docs/data/ladder.csv)."""
+    assert parse(Config, composed_tree("experiment=ablation_00_report")).run_name() == "cnn-uniform-s0-1b9b358ed5"
+
+
 def test_a_run_is_named_after_what_it_is() -> None:
     config = parse(Config, composed_tree("experiment=paper_resnet", "seed=4"))
     assert config.run_name() == f"resnet-uniform-top_half-s4-{config.identity()}"

@@ -60,7 +60,7 @@ class Learner:
         target_mode: Literal["eval", "train"] = "eval",
         shards: int = 1,
         ema: int | None = None,
-        compile: Callable[[nn.Module], nn.Module] = lambda network: network,
+        compile: Callable[[nn.Module], nn.Module] | None = None,
     ) -> None:
         self.network = network.eval()
         self.target = target.train(target_mode == "train")
@@ -75,11 +75,12 @@ class Learner:
         self._online = _Replicas(network, self.dtype, shards)
         self._target = _Replicas(target, self.dtype, shards)
         self.ema = ema  # updates
-        shared = {id(generator): generator for _, generator in _generators(network)}
-        self.evaluated = copy.deepcopy(network, shared) if ema else network
+        self.evaluated = copy.deepcopy(network) if ema else network
         self._evaluated = _Replicas(self.evaluated, self.dtype, shards) if ema else self._online
-        self._online_passes = [compile(replica) for replica in self._online.networks]
-        self._target_passes = [compile(replica) for replica in self._target.networks]
+        self._online_passes, self._target_passes = (
+            [compile(network) for network in replicas.networks] if compile else replicas.networks
+            for replicas in (self._online, self._target)
+        )
         if shards > 1:
             self._threads = ThreadPoolExecutor(shards, "learner", partial(torch.set_num_threads, 1))
         self.target_mode = target_mode
@@ -98,7 +99,7 @@ class Learner:
         discount: npt.NDArray[np.floating],
         weights: npt.NDArray[np.floating] | None = None,
     ) -> torch.Tensor:
-        """Take one optimizer step on a batch of transitions, then move the target network if its turn has come.
+        """Take one optimizer step on a batch of transitions, then move target and average if it is their turn.
 
         States (B, C, H, W) in 0..255; actions, rewards and discounts (B,), as `Objective` wants them; weights (B,) of
         the samples in the loss. Returns what each sample's value was off its target by, (B,), on the device.

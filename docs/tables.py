@@ -1,0 +1,26 @@
+"""What the scripts beside it share: the tables in docs/data, and the random player."""
+
+import csv
+from collections.abc import Callable, Collection, Iterable, Sequence
+from pathlib import Path
+
+RANDOM = 20_873  # a random player's mean (docs/reproduction.md)
+
+Row = dict[str, str]
+
+
+def updated(
+    table: Path,
+    columns: Sequence[str],
+    runs: Collection[str],
+    rows: Iterable[Row],
+    key: Callable[[Row], tuple[str, ...]],
+) -> list[Row]:
+    """A table's rows by `key`, once `rows` have taken the place of what it had of the runs of these names."""
+    kept = [row for row in csv.DictReader(table.read_text().splitlines()) if row["run"] not in runs]
+    merged = sorted([*kept, *rows], key=key)
+    with table.open("w") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(merged)
+    return merged
