@@ -61,6 +61,7 @@ def score_heatmap(ends: Sequence[int], scores: Sequence[float], length: int, uni
     axes.set_xlabel(unit, fontsize=7)
     axes.set_ylabel("score", fontsize=7)
     axes.locator_params(axis="x", nbins=4)
+    axes.xaxis.get_offset_text().set_fontsize(6)
     return _png(figure)
 
 
@@ -186,8 +187,8 @@ def _edges() -> npt.NDArray[np.float64]:
 def _square() -> "tuple[Figure, Axes]":
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(2.56, 2.56), dpi=100, layout="constrained")
-    axes = figure.add_subplot()
+    figure = Figure(figsize=(2.56, 2.56), dpi=100)
+    axes = figure.add_axes((0.17, 0.15, 0.78, 0.77))
     axes.tick_params(labelsize=6)
     return figure, axes
 

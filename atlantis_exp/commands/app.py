@@ -9,6 +9,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, TypeVar
@@ -144,12 +145,11 @@ def check(config_name: str, schema: type[T], arguments: list[str]) -> list[T]:
             raise ConfigError(f"{override.input_line}: several values are a sweep; add -m")
     hydras = [override for override in overrides if _is_hydras(override)]
     overrides = [override for override in overrides if not _is_hydras(override)]
-    known: dict[tuple[str, ...], set[str]] = {}
     try:
         with composing():
             if hydras:
                 _check_launcher(config_name, hydras)
-            return [_check_job(config_name, schema, job, known) for job in _jobs(overrides)]
+            return [_check_job(config_name, schema, job) for job in _jobs(overrides)]
     except (HydraException, OmegaConfBaseException) as error:
         reason = f": {error.__cause__}" if isinstance(error.__cause__, OmegaConfBaseException) else ""
         raise ConfigError(" ".join(re.split("Config search path|full_key:", f"{error}{reason}")[0].split())) from None
@@ -272,8 +272,7 @@ def _jobs(overrides: list[Override]) -> Iterator[list[str]]:
         yield list(combination)
 
 
-def _check_job(config_name: str, schema: type[T], texts: list[str], known: dict[tuple[str, ...], set[str]]) -> T:
-    """Check one job; `known` keeps the keys that each choice of group options gives, for the sweep's other jobs."""
+def _check_job(config_name: str, schema: type[T], texts: list[str]) -> T:
     overrides = {text: read_override(text) for text in texts}
     groups = _groups(config_name)
     chosen = tuple(text for text, override in overrides.items() if _key(override) in groups)
@@ -285,11 +284,7 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], known: dict[
             raise ConfigError(f"{text}: needed; choose with {folder}=OPTION (valid: {', '.join(sorted(options))})")
         if not isinstance(value, str) or value not in options:
             raise ConfigError(f"{folder}={value}: no such option in conf/{folder}; {nearest(str(value), options)}")
-    if chosen not in known:
-        tree = OmegaConf.to_container(compose(config_name, list(chosen)))
-        assert isinstance(tree, dict)
-        known[chosen] = set(flatten({str(key): value for key, value in tree.items()}))
-    keys = known[chosen]
+    keys = _keys(config_name, chosen)
     branches = {key.rsplit(".", depth)[0] for key in keys for depth in range(1, key.count(".") + 1)}
     for text, override in overrides.items():
         if text in chosen:
@@ -306,6 +301,14 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], known: dict[
     except InterpolationKeyError as error:
         missing = "".join(re.findall("'(.*)'", str(error)))
         raise ConfigError(f"${{{missing}}}: no such key; {_nearest_key(missing, keys)}") from None
+
+
+@cache
+def _keys(config_name: str, chosen: tuple[str, ...]) -> frozenset[str]:
+    """The keys that options of groups give, which many jobs of a sweep share."""
+    tree = OmegaConf.to_container(compose(config_name, list(chosen)))
+    assert isinstance(tree, dict)
+    return frozenset(flatten({str(key): value for key, value in tree.items()}))
 
 
 def _groups(config_name: str) -> set[str]:
@@ -325,7 +328,7 @@ def _key(override: Override) -> str:
     return override.key_or_group + (f"@{override.package}" if override.package else "")
 
 
-def _nearest_key(key: str, keys: set[str]) -> str:
+def _nearest_key(key: str, keys: frozenset[str]) -> str:
     """The nearest key beside it, or of any depth; a bare name is also compared with the last parts, as `lr` with
     `optimizer.lr`."""
     parent = key.rpartition(".")[0]

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,7 @@ GROUPS = {path.name: sorted(file.stem for file in path.glob("*.yaml")) for path 
 NO_PART = ("agent", "experiment", "hydra", "space")  # of a training, or chosen otherwise
 
 
+@cache
 def composed(*overrides: str) -> Config:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return checked(Config, compose("config", list(overrides)))
@@ -254,7 +256,7 @@ def test_a_mistake_ends_with_code_2_and_one_line_and_leaves_nothing_behind(tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("verb", ["", "evaluate", "ui"])
+@pytest.mark.parametrize("verb", ["", "evaluate"])
 def test_help_says_what_the_verb_does_and_which_verbs_there_are(tmp_path: Path, verb: str) -> None:
     done = outcome(tmp_path, *([verb] if verb else []), "--help")
     assert done.returncode == 0
@@ -285,7 +287,10 @@ def test_nothing_heavy_is_loaded_before_the_config_is_checked() -> None:
     assert heavy & set(done.stdout.split()) == set()
 
 
-@pytest.mark.parametrize("experiment", GROUPS["experiment"])
+@pytest.mark.parametrize(
+    "experiment",
+    ["fast", *(pytest.param(name, marks=pytest.mark.slow) for name in GROUPS["experiment"] if name != "fast")],
+)
 def test_every_option_of_every_group_goes_with_every_experiment(experiment: str) -> None:
     groups = {group: options for group, options in GROUPS.items() if group not in NO_PART}
     for turn in range(max(map(len, groups.values()))):

@@ -55,6 +55,7 @@ def test_a_comparison_is_a_page_figures_and_tables_in_a_folder_and_in_the_store(
     assert "cnn-seed-0-vs-cnn-seed-1" in str(small.info.run_name)
 
 
+@pytest.mark.slow
 def test_the_same_comparison_again_is_the_same_run(
     recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -94,6 +95,7 @@ def test_a_refusal_is_one_line_and_code_2_and_leaves_nothing_behind(
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
 
 
+@pytest.mark.slow
 def test_a_real_training_can_be_compared(
     tiny: Callable[..., Config], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

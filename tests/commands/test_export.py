@@ -43,7 +43,7 @@ def trained(tiny: Compose) -> Path:
 def test_exported_weights_score_what_their_card_says(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In half precision, which is what this limit takes; and by another protocol where the command line says so."""
+    """In half precision, which is what this limit takes."""
     monkeypatch.setattr(cards, "MOST_BYTES", 300_000)
     folder = tmp_path / "pretrained" / "tiny"
     outputs = (f"paths.outputs={trained}", "device=cpu")
@@ -76,20 +76,11 @@ def test_exported_weights_score_what_their_card_says(
     assert (facts["sha256"], facts["evaluation"]["num_envs"]) == (card.sha256, 1)
     assert (recorded / "artifacts" / "best_episode.mp4").stat().st_size > 1_000
 
-    for asked, protocol in (
-        (("evaluation.num_envs=2", "evaluation.video=false"), ["3", "0.9", "2000003"]),
-        (("episodes=1", "evaluation.video=false"), ["1", "0.9", "2000003"]),
-        (("evaluation=quick", "episodes=1", "evaluation.video=false"), ["1", "0.05", "1000003"]),
-    ):
-        assert run(monkeypatch, evaluate, *played, *asked) == 0
-        (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("│ here")]
-        assert [cell.strip() for cell in line.split("│")][-4:-1] == protocol
-
 
 @pytest.fixture
 def folder(tiny: Compose, tmp_path: Path) -> Path:
     """A folder of exported weights that nobody has trained."""
-    config = portable(tiny())
+    config = portable(tiny("evaluation.epsilon=0.9", "evaluation.seed=5"))
     weights = safetensors.torch.save(build_network(config, "network").state_dict())
     card = CardConfig(
         format=1,
@@ -139,6 +130,27 @@ def test_a_folder_that_was_tampered_with_is_one_line(
     error = capsys.readouterr().err
     assert line in error
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("asked", "protocol"),
+    [
+        pytest.param(("evaluation.num_envs=2",), ["2", "0.9", "5"], marks=pytest.mark.slow),
+        pytest.param(("episodes=1",), ["1", "0.9", "5"], marks=pytest.mark.slow),
+        (("evaluation=quick", "episodes=1"), ["1", "0.05", "1000003"]),
+    ],
+)
+def test_another_protocol_than_the_card_s_is_played_where_the_command_line_says_so(
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    asked: tuple[str, ...],
+    protocol: list[str],
+) -> None:
+    outputs = (f"paths.outputs={folder.parent}/o", "device=cpu", "tracking=none")
+    assert run(monkeypatch, evaluate, f"weights={folder}", *outputs, *asked, "evaluation.video=false") == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("│ here")]
+    assert [cell.strip() for cell in line.split("│")][-4:-1] == protocol
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"format": 1}'])

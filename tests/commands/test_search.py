@@ -222,6 +222,7 @@ def test_values_that_are_under_way_are_not_trained_twice(searching: Searching) -
     assert "trial 0, which is under way, has the same values" in session.trials[1].user_attrs["error"]
 
 
+@pytest.mark.slow
 def test_a_trial_below_the_median_is_committed_and_can_be_trained_to_its_end(searching: Searching) -> None:
     session = session_of(
         searching, "trials=2", "evaluation.every_steps=40", "pruning.trials=1", "pruning.evaluations=0"
@@ -251,6 +252,7 @@ def test_a_trial_below_the_median_is_committed_and_can_be_trained_to_its_end(sea
     assert [number for number, value in enumerate(session.trials) if value.state.name == "COMPLETE"] == [0]
 
 
+@pytest.mark.slow
 def test_a_trial_that_fails_is_recorded_and_the_search_goes_on(
     searching: Searching, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -287,6 +289,7 @@ def test_a_name_is_one_searchs(searching: Searching) -> None:
         session_of(searching, "name=mine", "env.size=48", space=("optimizer=choice(adam)",))
 
 
+@pytest.mark.slow
 def test_at_the_end_of_its_time_a_search_leaves_its_trial_to_be_continued(searching: Searching) -> None:
     for seconds in (2, 8, 32):  # which can be over before a first trial, where other programs want the machine
         config, fixed = searching(f"budget.wall_clock={seconds}s", "phase.quick.steps=100_000")

@@ -1,6 +1,7 @@
 """What runs are called, for configs that differ in every way."""
 
 import itertools
+from functools import cache
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -10,6 +11,7 @@ from atlantis_exp.commands.titles import colour, group, title
 from atlantis_exp.config import Config
 
 
+@cache
 def composed(overrides: str) -> Config:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return checked(Config, compose("config", overrides.split()))

@@ -258,6 +258,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(("umount", str(disk)), check=True)
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_clear_line_and_costs_nothing_committed(tiny: Compose, small_disk: Path) -> None:
     chosen = (*SHORT, "phase.quick.steps=100", "tracking.commit_seconds=1e-9")
     config = tiny(*chosen, f"paths.outputs={small_disk}")
@@ -358,6 +359,7 @@ def test_a_killed_run_is_shown_as_interrupted_then_continued_and_sigterm_ends_it
     assert folder.status == "KILLED"
 
 
+@pytest.mark.slow
 def test_the_next_command_tells_mlflow_of_a_run_that_was_killed(tiny: Compose) -> None:
     config = tiny(*SHORT, "budget.steps=20", "tracking=mlflow")
     outputs = Path(config.paths.outputs)

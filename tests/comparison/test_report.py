@@ -122,6 +122,7 @@ def test_figures_are_pictures_of_something_and_take_on_the_pages_ink(comparison:
     assert "cnn 1,673" in figures["evaluation"].alt
 
 
+@pytest.mark.slow
 def test_the_same_comparison_draws_the_same_figures(comparison: Comparison) -> None:
     def content(figures: dict[str, Drawn]) -> list[tuple[str, bytes]]:
         return [(figure.svg, figure.png) for figure in figures.values()]

@@ -255,7 +255,7 @@ def test_a_network_whose_samples_meet_is_not_split() -> None:
 # Compilation
 
 
-@every_network
+@pytest.mark.parametrize("network_class", [DQNCnn, pytest.param(ResNetDQN, marks=pytest.mark.slow)])
 def test_a_compiled_learner_learns_the_same(network_class: type[nn.Module]) -> None:
     """By a backend that needs no compiler; dropout masks are drawn from the same generators."""
     backend = CompileCounterWithBackend("aot_eager")
@@ -493,8 +493,14 @@ def test_the_first_loss_that_is_no_number_is_remembered(poison: float) -> None:
 
 @every_network
 @every_precision
-@pytest.mark.parametrize("target_mode", ["eval", "train"])
-@pytest.mark.parametrize("ema", [None, 15])
+@pytest.mark.parametrize(
+    ("target_mode", "ema"),
+    [
+        ("eval", 15),
+        ("train", None),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("eval", None), ("train", 15))),
+    ],
+)
 def test_a_restored_learner_continues_bit_for_bit(
     network_class: type[nn.Module], precision: Precision, target_mode: Literal["eval", "train"], ema: int | None
 ) -> None:

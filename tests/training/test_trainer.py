@@ -94,12 +94,12 @@ def test_the_same_seed_gives_the_same_training_and_another_seed_another(
             marks=pytest.mark.slow,
         ),
         ("env.num_envs=3", "env.workers=2", "sampler=prioritized", "phase.quick.sampler=prioritized"),
-        (
-            "objective=quantile",
-            "lr_schedule=one_cycle",
-            "objective.n_step=3",
-            "objective.target.tau=1",
-            "objective.target.every=3",
+        pytest.param(
+            (
+                *("objective=quantile", "lr_schedule=one_cycle", "objective.n_step=3"),
+                *("objective.target.tau=1", "objective.target.every=3"),
+            ),
+            marks=pytest.mark.slow,
         ),
         pytest.param(("model=resnet", "env.size=16", "env.num_envs=8", "env.workers=2"), marks=pytest.mark.slow),
         pytest.param(("model=cnn", "env.num_envs=8", "env=atlantis_standard", "env.size=40"), marks=pytest.mark.slow),
@@ -125,6 +125,7 @@ def test_a_training_killed_in_every_phase_is_the_unbroken_one_bit_for_bit(
     assert print_of(session, tmp_path / "broken") == print_of(unbroken, tmp_path / "unbroken")
 
 
+@pytest.mark.slow
 def test_the_time_of_a_commit_changes_nothing(tiny: Compose, started: Start, tmp_path: Path) -> None:
     prints = []
     for name, seconds in (("every-step", "1e-9"), ("at-the-end", "1e9")):
@@ -135,6 +136,7 @@ def test_the_time_of_a_commit_changes_nothing(tiny: Compose, started: Start, tmp
     assert prints[0] == prints[1]
 
 
+@pytest.mark.slow
 def test_a_commit_finds_everything_that_fell_due_at_its_step_done(
     tiny: Compose, started: Start, tmp_path: Path
 ) -> None:
@@ -197,7 +199,10 @@ def test_learning_rate_and_sampler_change_with_the_phase_and_nothing_else_does(
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])
-@pytest.mark.parametrize(("learn_every", "learn_start"), [(1, 0), (4, 20), (7, 33), (50, 49)])
+@pytest.mark.parametrize(
+    ("learn_every", "learn_start"),
+    [(7, 33), *(pytest.param(*cadence, marks=pytest.mark.slow) for cadence in ((1, 0), (4, 20), (50, 49)))],
+)
 def test_updates_are_those_that_a_naive_loop_counts(
     tiny: Compose, started: Start, tmp_path: Path, num_envs: int, learn_every: int, learn_start: int
 ) -> None:
@@ -232,7 +237,8 @@ def test_updates_are_those_that_a_naive_loop_counts(
     assert tape == naive
 
 
-@pytest.mark.parametrize("num_envs", [1, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("num_envs", [1, 8])
 def test_a_prioritized_training_is_the_same_whenever_it_is_committed(
     tiny: Compose, started: Start, tmp_path: Path, num_envs: int
 ) -> None:
@@ -328,17 +334,7 @@ def test_a_truncated_episode_bootstraps_and_a_terminated_one_does_not(
     assert np.flatnonzero(state["back"] == 0).tolist() == [0, 41, 82]  # observations that begin an episode
 
 
-def test_curves_of_runs_with_different_num_envs_share_their_steps(
-    tiny: Compose, started: Start, tmp_path: Path
-) -> None:
-    for num_envs in (1, 3):
-        trainer = started(tiny(f"env.num_envs={num_envs}", "env.workers=1"), tmp_path / str(num_envs))
-        trainer.run()
-    steps = [[step for step, _ in curve(tmp_path / name, "actions/epsilon")] for name in ("1", "3")]
-    assert steps[0] == steps[1] == list(range(20, 161, 20))
-
-
-def test_smoothed_curves_stand_on_the_common_grid_and_raw_scores_where_they_happened(
+def test_curves_of_any_num_envs_share_their_steps_and_raw_scores_stand_where_they_happened(
     tiny: Compose, started: Start, tmp_path: Path
 ) -> None:
     for num_envs in (1, 3):
@@ -346,6 +342,7 @@ def test_smoothed_curves_stand_on_the_common_grid_and_raw_scores_where_they_happ
             tiny(f"env.num_envs={num_envs}", "env.workers=1", "env.max_steps=35"), tmp_path / f"{num_envs}"
         )
         trainer.run()
+        assert [step for step, _ in curve(tmp_path / f"{num_envs}", "actions/epsilon")] == list(range(20, 161, 20))
         for key in ("score/mean_20", "score/mean_100", "score/length_mean_100", "throughput/episodes"):
             assert {step % 20 for step, _ in curve(tmp_path / f"{num_envs}", key)} == {0}, key
         evaluated = [step for step, _ in curve(tmp_path / f"{num_envs}", "evaluation/mean")]
@@ -355,6 +352,7 @@ def test_smoothed_curves_stand_on_the_common_grid_and_raw_scores_where_they_happ
         assert {step % 35 for step, _ in raw} == {0}
 
 
+@pytest.mark.slow
 def test_the_table_of_episodes_is_whole_after_a_kill_and_agrees_with_the_journal(
     tiny: Compose, started: Start, tmp_path: Path
 ) -> None:
@@ -378,7 +376,7 @@ def test_the_table_of_episodes_is_whole_after_a_kill_and_agrees_with_the_journal
 def test_pictures_count_windows_and_evaluations_so_that_runs_stand_side_by_side(
     tiny: Compose, started: Start, tmp_path: Path
 ) -> None:
-    config = tiny("env.max_steps=20", "evaluation.every_steps=40")
+    config = tiny("env.max_steps=20", "evaluation.every_steps=40", "tracking.histogram_episodes=2")
     started(config, tmp_path).run(after(70))
     started(config, tmp_path).run()
     positions: dict[str, list[int]] = {}
@@ -437,7 +435,9 @@ def test_a_loss_that_is_no_number_stops_the_run_at_its_last_good_commit(
     assert print_of(started(config, tmp_path), tmp_path) == good
 
 
-@pytest.mark.parametrize("step", [80, 120])  # one amid the training, the one at its end
+@pytest.mark.parametrize(  # one amid the training, the one at its end
+    "step", [80, pytest.param(120, marks=pytest.mark.slow)]
+)
 def test_an_evaluation_that_is_asked_to_stop_is_made_good(
     tiny: Compose, started: Start, tmp_path: Path, step: int
 ) -> None:
@@ -454,6 +454,7 @@ def test_an_evaluation_that_is_asked_to_stop_is_made_good(
     assert print_of(continued, tmp_path / "broken") == print_of(unbroken, tmp_path / "unbroken")
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_after_its_worker_was_killed(tiny: Compose, started: Start, tmp_path: Path) -> None:
     config = tiny("env.num_envs=3", "env.workers=2")
     unbroken = started(config, tmp_path / "unbroken")
