@@ -4,6 +4,8 @@ What an update computes is counted by torch's flop counter: convolutions and mat
 forward and backward pass and of the target network's forward pass, no gradient with regard to the states. What it takes
 is all of `Learner.update`: uint8 in, loss, optimizer and soft update included. Each turn is compared with a
 multiplication of square matrices in the same number format, right before it in the same process.
+
+`--against OVERRIDE...` sets the same updates under these overrides beside them: `compile=true`, `training.ema=2000`.
 """
 
 import argparse
@@ -15,7 +17,7 @@ import numpy as np
 import torch
 
 from atlantis_exp.build import build_learner, choose_device, count_update_flops
-from atlantis_exp.config import Config
+from atlantis_exp.config import Config, ConfigError
 from benchmarks.composition import composed
 from benchmarks.contest import calls_per_second, print_results, print_table, take_turns
 
@@ -33,10 +35,9 @@ class Case(NamedTuple):
     def name(self) -> str:
         return f"{self.model}_{self.precision}"
 
-    @property
-    def config(self) -> Config:
-        overrides = (f"training.batch_size={self.batch_size}", f"training.precision={self.precision}")
-        return composed(f"model={self.model}", *overrides)
+    def config(self, *overrides: str) -> Config:
+        named = (f"model={self.model}", f"training.batch_size={self.batch_size}")
+        return composed(*named, f"training.precision={self.precision}", *overrides)
 
 
 CASES = tuple(Case(*network, precision) for network in (("cnn", 128), ("resnet", 32)) for precision in ("bf16", "fp32"))
@@ -78,10 +79,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table and the JSON line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.learner", description="the learner's FLOP rate")
     parser.add_argument("--cases", nargs="*", choices=[case.name for case in CASES], default=None)
+    parser.add_argument("--against", nargs="+", metavar="OVERRIDE", default=(), help="updates to compare with these")
     parser.add_argument("--rounds", type=int, default=7, help="turns of each case")
     parser.add_argument("--seconds", type=float, default=2.0, help="length of a turn")
     args = parser.parse_args(arguments)
     cases = [case for case in CASES if args.cases is None or case.name in args.cases]
+    try:
+        others = [case.config(*args.against) for case in cases]
+    except ConfigError as error:
+        parser.error(str(error))
 
     threads = torch.get_num_threads()
     turns: dict[str, Callable[[], float]] = {}
@@ -93,19 +99,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
             return calls_per_second(call, args.seconds)
 
         torch.set_num_threads(threads)
-        call()  # a first call allocates
+        call()  # a first call allocates, or compiles
         return turn
 
-    for case in cases:
-        config = case.config
+    for case, other in zip(cases, others, strict=True):
+        config = case.config()
         flops[f"gemm_{case.name}"], flops[case.name] = 2 * _SIDE**3, count_update_flops(config)
         turns[f"gemm_{case.name}"] = measured(gemm_of(case.precision), threads)
         update = update_of(config)
         turns[case.name] = measured(update, torch.get_num_threads())
+        if args.against:
+            update = update_of(other)
+            turns[f"{case.name}_against"] = measured(update, torch.get_num_threads())
     calls = take_turns(turns, args.rounds)
 
     results: dict[str, Any] = {"threads": threads}
-    rows = []
+    rows, compared = [], []
     for case in cases:
         rate, gemm_rate = (statistics.median(calls[name]) * flops[name] for name in (case.name, f"gemm_{case.name}"))
         shares = [
@@ -129,8 +138,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 f"{share:.0%} ({min(shares):.0%}-{max(shares):.0%})",
             )
         )
+        if args.against:
+            pairs = zip(calls[f"{case.name}_against"], calls[case.name], strict=True)
+            ratios = [against / plain for against, plain in pairs]
+            results[f"against_{case.name}"] = statistics.median(ratios)
+            compared.append((case.name, f"{statistics.median(ratios):.3f} ({min(ratios):.3f}-{max(ratios):.3f})"))
     columns = ("", "batch", "FLOPs a sample", "update", "FLOPs", "GEMM", "share")
     print_table(f"one update, {threads} threads", columns, rows)
+    if args.against:
+        print_table(" ".join(args.against), ("", "times as many updates a second"), compared)
     print_results(results)
 
 

@@ -88,14 +88,21 @@ def test_sb3_stores_the_bytes_of_its_arrays() -> None:
 
 
 def test_learner_relates_its_arithmetic_to_the_machines(capsys: pytest.CaptureFixture[str]) -> None:
-    results = results_of(learner.main, "--cases cnn_fp32 --rounds 1 --seconds 0.1", capsys)
+    results = results_of(learner.main, "--cases cnn_fp32 --rounds 1 --seconds 0.1 --against training.ema=10", capsys)
     assert 0 < results["gemm_share_cnn_fp32"] < 1.5
+    assert 0 < results["against_cnn_fp32"] < 10
+
+
+def test_a_mistaken_override_of_a_learner_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        learner.main(["--against", "traning.ema=10"])
+    assert "did you mean 'training.ema'?" in capsys.readouterr().err
 
 
 def test_the_flops_of_an_update_are_those_of_its_layers() -> None:
     # multiply-adds of the forward pass by layer; the first convolution has no gradient with regard to its input
     first, others = 20 * 20 * 32 * 4 * 64, 9 * 9 * 64 * 32 * 16 + 7 * 7 * 64 * 64 * 9 + 3136 * 512 + 512 * 4
-    assert count_update_flops(learner.Case("cnn", 2, "fp32").config) == 2 * 2 * (3 * first + 4 * others)
+    assert count_update_flops(learner.Case("cnn", 2, "fp32").config()) == 2 * 2 * (3 * first + 4 * others)
 
 
 @pytest.mark.slow
