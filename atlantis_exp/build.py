@@ -252,13 +252,6 @@ def run_evaluation(
     Raises:
         Stopped: when `stop` says so.
     """
-    played = 0
-
-    def on_episode(episode: Episode) -> None:
-        nonlocal played
-        played += 1
-        progress.evaluated_episode(played, episodes, episode)
-
     with emulators or build_emulators(env, min(evaluation.num_envs, episodes)) as emulators:
         result = evaluate(
             actor,
@@ -268,7 +261,7 @@ def run_evaluation(
             seed=evaluation.seed,
             size=env.size,
             stack=env.stack,
-            on_episode=on_episode,
+            on_step=progress.evaluating,
             stop=stop,
         )
     if not evaluation.video:

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -179,12 +179,13 @@ def evaluate(
     seed: int,
     size: int,
     stack: int,
-    on_episode: Callable[[Episode], None] = lambda _: None,
+    on_step: Callable[[Sequence[Episode], int], None] = lambda *_: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Evaluation:
     """Play `episodes` episodes side by side; what each is like depends on `seed` and its own index alone.
 
-    size in pixels and stack in observations, as the actor's states want them.
+    size in pixels and stack in observations, as the actor's states want them. on_step is told of all episodes, and how
+    many of them are over, after every step of those that are played.
 
     Raises:
         Stopped: when `stop`, which is asked before every step, says so.
@@ -194,6 +195,7 @@ def evaluate(
     stacks = FrameStack(emulators.num_envs, size, stack)
     waiting = iter(range(episodes))
     playing: dict[int, int] = {}  # environment to the episode it plays
+    over = 0  # episodes
 
     def begin(env: int) -> None:
         index = next(waiting, None)
@@ -225,8 +227,9 @@ def evaluate(
             episode.frames += int(steps.frames[row])
             if steps.terminated[row] or steps.truncated[row]:
                 episode.truncated = bool(steps.truncated[row])
-                on_episode(episode)
+                over += 1
                 begin(env)
+        on_step(played, over)
     return Evaluation(epsilon, played)
 
 

@@ -2,6 +2,7 @@
 
 import time
 from collections import deque
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,12 +53,17 @@ class Progress:
         elif not first:
             self.say(self._line(trainer))
 
-    def evaluated_episode(self, number: int, episodes: int, episode: "Episode") -> None:
-        """To be called at the end of every evaluated episode."""
+    def evaluating(self, episodes: Sequence["Episode"], over: int) -> None:
+        """To be called after every step of an evaluation: writes a line now and then. Good games last for minutes."""
         now = time.monotonic()
+        if self._shown == 0.0:
+            self._shown = now
         if now - self._shown >= _PLAIN_SECONDS:
             self._shown = now
-            self.say(f"  evaluation: episode {number}/{episodes}, score {episode.score:,.0f}, {episode.steps:,} steps")
+            steps, high = sum(episode.steps for episode in episodes), max(episode.score for episode in episodes)
+            self.say(
+                f"  evaluation: {over} of {len(episodes)} episodes over, {steps:,} steps, highest score {high:,.0f}"
+            )
 
     def evaluated(self, trainer: "Trainer", evaluation: "Evaluation") -> None:
         """To be called after every evaluation."""

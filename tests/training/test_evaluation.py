@@ -48,9 +48,13 @@ def test_a_network_evaluated_twice_plays_twice_the_same(tiny: Compose, played: C
 
 
 def test_more_environments_than_episodes_play_each_episode_once(played: Callable[..., Evaluation]) -> None:
-    ended: list[Episode] = []
-    play = partial(played, on_episode=ended.append)
-    assert sorted(episode.seed for episode in play(3, episodes=2).episodes) == sorted(episode.seed for episode in ended)
+    told: list[tuple[list[int], int]] = []
+    play = partial(played, on_step=lambda episodes, over: told.append(([each.steps for each in episodes], over)))
+    assert len({episode.seed for episode in play(3, episodes=2).episodes}) == 2
+    assert told == [([step, step], 0 if step < 25 else 2) for step in range(1, 26)]
+    told.clear()
+    play(1, episodes=2)
+    assert told == [([min(step, 25), max(step - 25, 0)], step // 25) for step in range(1, 51)]
 
 
 def test_an_episode_can_be_seen_again_from_its_seed_and_actions(

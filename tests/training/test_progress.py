@@ -1,6 +1,7 @@
 """What a person is told about an evaluation."""
 
 import io
+import itertools
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,6 +10,20 @@ from rich.console import Console
 
 from atlantis_exp.training.evaluation import Episode, Evaluation
 from atlantis_exp.training.progress import Progress
+
+
+def test_an_evaluation_says_how_far_it_is_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    text, clock = io.StringIO(), itertools.count(100, 4)  # seconds
+    monkeypatch.setattr("time.monotonic", lambda: next(clock))
+    progress = Progress(Console(file=text, width=300))
+    episodes = [Episode(0, 1_200.0), Episode(1), Episode(2)]
+    for over in range(7):
+        episodes[1].actions.append(0)
+        progress.evaluating(episodes, over // 3)
+    assert text.getvalue().splitlines() == [
+        "  evaluation: 1 of 3 episodes over, 4 steps, highest score 1,200",
+        "  evaluation: 2 of 3 episodes over, 7 steps, highest score 1,200",
+    ]
 
 
 @pytest.mark.parametrize(
