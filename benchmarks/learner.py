@@ -85,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_args(arguments)
     cases = [case for case in CASES if args.cases is None or case.name in args.cases]
     try:
-        others = [case.config(*args.against) for case in cases]
+        others = {case: case.config(*args.against) for case in cases if args.against}
     except ConfigError as error:
         parser.error(str(error))
 
@@ -102,14 +102,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         call()  # a first call allocates, or compiles
         return turn
 
-    for case, other in zip(cases, others, strict=True):
+    for case in cases:
         config = case.config()
         flops[f"gemm_{case.name}"], flops[case.name] = 2 * _SIDE**3, count_update_flops(config)
         turns[f"gemm_{case.name}"] = measured(gemm_of(case.precision), threads)
         update = update_of(config)
         turns[case.name] = measured(update, torch.get_num_threads())
-        if args.against:
-            update = update_of(other)
+        if case in others:
+            update = update_of(others[case])
             turns[f"{case.name}_against"] = measured(update, torch.get_num_threads())
     calls = take_turns(turns, args.rounds)
 
@@ -138,14 +138,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 f"{share:.0%} ({min(shares):.0%}-{max(shares):.0%})",
             )
         )
-        if args.against:
+        if case in others:
             pairs = zip(calls[f"{case.name}_against"], calls[case.name], strict=True)
             ratios = [against / plain for against, plain in pairs]
-            results[f"against_{case.name}"] = statistics.median(ratios)
-            compared.append((case.name, f"{statistics.median(ratios):.3f} ({min(ratios):.3f}-{max(ratios):.3f})"))
+            results[f"against_{case.name}"] = ratio = statistics.median(ratios)
+            compared.append((case.name, f"{ratio:.3f} ({min(ratios):.3f}-{max(ratios):.3f})"))
     columns = ("", "batch", "FLOPs a sample", "update", "FLOPs", "GEMM", "share")
     print_table(f"one update, {threads} threads", columns, rows)
-    if args.against:
+    if compared:
         print_table(" ".join(args.against), ("", "times as many updates a second"), compared)
     print_results(results)
 

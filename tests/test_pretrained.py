@@ -17,7 +17,9 @@ FOLDERS = sorted(path.parent for path in REPOSITORY.glob("pretrained/*/card.json
 def test_a_folder_is_what_its_card_says(folder: Path) -> None:
     card, weights = read_card(folder)  # which checks the schema and the checksum
     assert len(weights) <= MOST_BYTES
-    assert card.sha256 in (folder / "README.md").read_text()
+    page = (folder / "README.md").read_text()
+    assert card.sha256 in page
+    assert f"evaluate weights=pretrained/{folder.name} " in page
     actor = build_exported_actor(card.config, weights, "cpu")
     assert isinstance(actor, EpsilonGreedy)
     env = card.config.env

@@ -256,7 +256,7 @@ def test_a_mistake_ends_with_code_2_and_one_line_and_leaves_nothing_behind(tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("verb", ["", "evaluate"])
+@pytest.mark.parametrize("verb", ["", "evaluate", "ui"])
 def test_help_says_what_the_verb_does_and_which_verbs_there_are(tmp_path: Path, verb: str) -> None:
     done = outcome(tmp_path, *([verb] if verb else []), "--help")
     assert done.returncode == 0
