@@ -23,10 +23,10 @@ run: setup  ## random baseline, both networks trained and evaluated on the CPU, 
 	$(BIN)/python -m atlantis_exp report
 
 test: lint  ## lint, types and the quick tests
-	$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2
+	$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 test-all: lint  ## every test, the slow ones too
-	$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2 -m ''
+	$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2 --dist loadfile -m ''
 
 test-slurm: setup  ## a sweep on a real Slurm, where Debian's slurmctld, slurmd and slurm-client are installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[slurm]'

@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import cast
@@ -14,10 +14,10 @@ import safetensors.torch
 import torch
 from safetensors import SafetensorError
 from torch import nn
-from torch.utils.flop_counter import FlopCounterMode
 
 from atlantis_exp import config as cfg
-from atlantis_exp.faults import Fault
+from atlantis_exp.checking import to_dict
+from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.game.emulator import ACTIONS, Emulator
 from atlantis_exp.game.preprocessing import FrameStack, Preprocessing
 from atlantis_exp.game.vector import Emulators, make_emulators
@@ -32,7 +32,6 @@ from atlantis_exp.learning.schedules import (
     OneCycle,
     Schedule,
 )
-from atlantis_exp.media import film, scene
 from atlantis_exp.networks.cnn import DQNCnn
 from atlantis_exp.networks.dropout import seed_dropout
 from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
@@ -40,13 +39,15 @@ from atlantis_exp.networks.resnet import ResNetDQN
 from atlantis_exp.networks.resnet_fast import ResNetFast
 from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.replay.samplers import PrioritizedSampler, Sampler, TopHalfSampler, UniformSampler
-from atlantis_exp.tracking.journal import Model, Tracker, read
+from atlantis_exp.runs.folder import CHECKPOINTS
+from atlantis_exp.runs.journal import Tracker
 from atlantis_exp.training.actor import Actor, ConstantActor, EpsilonGreedy, PersonActor, RandomActor
-from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints
-from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate, replay
-from atlantis_exp.training.forecast import Forecast, forecast
+from atlantis_exp.training.checkpoint import Checkpoints
+from atlantis_exp.training.evaluator import Evaluator
+from atlantis_exp.training.plan import Cadence, Phase, Plan
 from atlantis_exp.training.progress import Progress
-from atlantis_exp.training.trainer import Cadence, Evaluate, Phase, Plan, Trainer
+from atlantis_exp.training.recorder import Recorder
+from atlantis_exp.training.trainer import Trainer
 
 _THREADS = torch.get_num_threads()  # torch's own choice, before anything here changes it
 
@@ -121,7 +122,7 @@ def choose_device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if name.startswith("cuda") and not torch.cuda.is_available():
-        raise cfg.ConfigError(f"device={name}: this machine has no CUDA device; valid: auto, cpu")
+        raise ConfigError(f"device={name}: this machine has no CUDA device; valid: auto, cpu")
     return torch.device(name)
 
 
@@ -150,7 +151,7 @@ def build_network(config: cfg.Config, name: str) -> nn.Module:
 
 def build_optimizer(optimizer: cfg.AdamConfig | cfg.RmsPropConfig, network: nn.Module) -> torch.optim.Optimizer:
     """The optimizer of all of a network's parameters."""
-    settings = cfg.to_dict(optimizer)
+    settings = to_dict(optimizer)
     name = settings.pop("name")
     if isinstance(optimizer, cfg.AdamConfig):
         settings["betas"] = optimizer.betas
@@ -161,7 +162,7 @@ def build_optimizer(optimizer: cfg.AdamConfig | cfg.RmsPropConfig, network: nn.M
 
 
 def build_learner(config: cfg.Config) -> Learner:
-    """Both networks, the optimizer, the objective."""
+    """Both networks, the optimizer, the objective; sets torch's threads for this process, and keeps memory it frees."""
     keep_freed_memory()
     device = choose_device(config.device)
     target = config.objective.target
@@ -196,24 +197,10 @@ def _compiled(network: nn.Module) -> nn.Module:
 
 def build_schedule(schedule: cfg.EpsilonConfig | cfg.LrScheduleConfig) -> Schedule:
     """A function of the training's progress."""
-    settings = cfg.to_dict(schedule)
+    settings = to_dict(schedule)
     del settings["name"]
     built: Schedule = SCHEDULES[type(schedule)](**settings)
     return built
-
-
-def count_update_flops(config: cfg.Config) -> int:
-    """Floating-point operations of one update, two a multiply-add, in convolutions and matrix products alone.
-
-    Counted on a learner of its own: forward, backward and the objective's passes, whatever they are.
-    """
-    threads = torch.get_num_threads()
-    learner = build_learner(dataclasses.replace(config, threads=1, compile=False))  # the counter sees this thread alone
-    states = np.zeros((2, config.env.stack, config.env.size, config.env.size), np.uint8)
-    with FlopCounterMode(display=False) as counter:
-        learner.update(states, np.zeros(2, np.int64), np.zeros(2), states, np.zeros(2))
-    torch.set_num_threads(threads)
-    return int(counter.get_total_flops() * config.training.batch_size // len(states))
 
 
 def build_plan(config: cfg.Config) -> Plan:
@@ -221,7 +208,7 @@ def build_plan(config: cfg.Config) -> Plan:
     objective = config.objective
     phases = []
     for name, phase in config.phase.items():
-        sampler = cfg.to_dict(config.sampler_of(name))
+        sampler = to_dict(config.sampler_of(name))
         del sampler["name"]
         built = SAMPLERS[type(config.sampler_of(name))](**sampler)
         phases.append(Phase(name, phase.episodes or phase.steps or 0, phase.lr, built))
@@ -238,78 +225,6 @@ def build_plan(config: cfg.Config) -> Plan:
     )
 
 
-def run_evaluation(
-    actor: Actor,
-    env: cfg.EnvConfig,
-    evaluation: cfg.EvaluationConfig,
-    episodes: int,
-    progress: Progress,
-    stop: Callable[[], bool] = lambda: False,
-    emulators: Emulators | None = None,
-) -> tuple[Evaluation, bytes | None]:
-    """Evaluate an actor on emulators made for it; with the film of the best episode where the config asks for it.
-
-    Raises:
-        Stopped: when `stop` says so.
-    """
-    with emulators or build_emulators(env, min(evaluation.num_envs, episodes)) as emulators:
-        result = evaluate(
-            actor,
-            emulators,
-            episodes=episodes,
-            epsilon=evaluation.epsilon,
-            seed=evaluation.seed,
-            size=env.size,
-            stack=env.stack,
-            on_step=progress.evaluating,
-            stop=stop,
-        )
-    if not evaluation.video:
-        return result, None
-    return result, film_episode(result.best, actor, env)
-
-
-def film_episode(episode: Episode, actor: Actor, env: cfg.EnvConfig) -> bytes:
-    """An mp4 of an episode at the game's own speed of 60 frames a second, on average, with who decided what beside."""
-    chooser = "network" if isinstance(actor, EpsilonGreedy) else "constant player"
-    q_values = actor.q_values if isinstance(actor, EpsilonGreedy) else None
-
-    def pictures() -> Iterator[npt.NDArray[np.uint8]]:
-        for step, moment in enumerate(replay(episode, make_emulator(env)(), env.stack, q_values)):
-            lines = (f"step {step:,} of {episode.steps:,}", f"score {moment.score:,.0f} of {episode.score:,.0f}")
-            source = "random" if moment.random else chooser
-            yield scene(moment.screen, lines, source, ACTIONS, moment.action, moment.q_values)
-
-    return film(pictures(), 60 * episode.steps / episode.frames)
-
-
-def stored_weights(config: cfg.Config, folder: Path, weights: str) -> tuple[bytes, int]:
-    """A stored run's network as safetensors, from its last commit or its best evaluation, and that step.
-
-    A folder without checkpoints, as one that was brought from a server, has those of its evaluations.
-
-    Raises:
-        Fault: where the run has no such weights.
-    """
-    try:
-        state = Checkpoints(folder / "checkpoints", config.identity()).load()
-    except CheckpointError as error:
-        raise Fault(f"run {folder.name}: {error}") from error
-    if state is None:
-        models = [record for _, record in read(folder) if isinstance(record, Model)]
-        stored = [model for model in models if weights == "latest" or model.best]
-        if not stored:
-            raise Fault(f"run {folder.name} has neither a checkpoint nor an evaluation yet")
-        return (folder / "artifacts" / stored[-1].path).read_bytes(), stored[-1].step
-    if weights == "latest":
-        learner = state["learner"]
-        return safetensors.torch.save(learner.get("evaluated", learner["network"])), int(state["counters"]["steps"])
-    path = folder / "artifacts" / "best.safetensors"
-    if not path.exists():
-        raise Fault(f"run {folder.name} has no evaluation yet, so no best weights; weights=latest has some")
-    return path.read_bytes(), int(state["best_step"])
-
-
 def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Actor:
     """The player that a training of this config has made, from its network as safetensors.
 
@@ -324,24 +239,6 @@ def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Acto
     return EpsilonGreedy(learner.q_values, len(ACTIONS), watches=True)
 
 
-def build_forecast(config: cfg.Config, steps_done: int) -> Forecast:
-    """What the rest of this training will cost here; measured on parts of its own."""
-    with build_emulators(config.env, config.env.num_envs) as emulators:
-        return forecast(
-            build_plan(config),
-            build_learner(config),
-            emulators,
-            capacity=config.replay.capacity,
-            max_bytes=config.replay.max_bytes,
-            size=config.env.size,
-            stack=config.env.stack,
-            outputs=Path(config.paths.outputs),
-            steps_done=steps_done,
-            max_steps=config.budget.steps,
-            evaluations_an_episode=1 / (config.evaluation.every_episodes or float("inf")),
-        )
-
-
 def build_person(env: cfg.EnvConfig, choose: Callable[[npt.NDArray[np.uint8]], int]) -> tuple[PersonActor, Emulators]:
     """A person at the keyboard, and the one emulator whose screen they see."""
     emulator = make_emulator(env)()
@@ -353,40 +250,66 @@ def build_baseline(agent: cfg.BaselineAgentConfig) -> Actor:
     return RandomActor(len(ACTIONS)) if agent.name == "random" else ConstantActor(agent.action)
 
 
+def build_evaluator(env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig) -> Evaluator:
+    """What evaluates any actor by this protocol."""
+    return Evaluator(
+        make_emulators=partial(build_emulators, env),
+        make_emulator=make_emulator(env),
+        epsilon=evaluation.epsilon,
+        seed=evaluation.seed,
+        num_envs=evaluation.num_envs,
+        size=env.size,
+        stack=env.stack,
+        video=evaluation.video,
+    )
+
+
+def build_memory(config: cfg.Config) -> ReplayMemory:
+    """An empty replay memory."""
+    env, replay = config.env, config.replay
+    return ReplayMemory(replay.capacity, (env.size, env.size), stack=env.stack, budget_bytes=replay.max_bytes)
+
+
+def build_cadence(evaluation: cfg.EvaluationConfig, tracking: cfg.TrackingConfig) -> Cadence:
+    """How often a training is written down."""
+    return Cadence(
+        curve_steps=tracking.every_steps,
+        histogram_episodes=tracking.histogram_episodes,
+        commit_episodes=tracking.commit_episodes,
+        commit_seconds=tracking.commit_seconds,
+        evaluate_episodes=evaluation.every_episodes,
+        evaluate_steps=evaluation.every_steps,
+        evaluate_at_end=evaluation.at_end,
+        interim_episodes=evaluation.interim_episodes or evaluation.episodes,
+        final_episodes=evaluation.episodes,
+    )
+
+
 def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: Progress, about: str = "") -> Trainer:
     """All of a run; it writes under `folder` only. `about` opens its description, in markdown."""
     env = config.env
-    learner = build_learner(config)
-    actor = EpsilonGreedy(learner.q_values, len(ACTIONS))
+    plan, learner, memory = build_plan(config), build_learner(config), build_memory(config)
     watched = EpsilonGreedy(learner.evaluated_q_values, len(ACTIONS), watches=True)
-    evaluation: Evaluate = partial(run_evaluation, watched, env, config.evaluation)
     return Trainer(
-        plan=build_plan(config),
-        cadence=Cadence(
-            curve_steps=config.tracking.every_steps,
-            histogram_episodes=config.tracking.histogram_episodes,
-            commit_episodes=config.tracking.commit_episodes,
-            commit_seconds=config.tracking.commit_seconds,
-            evaluate_episodes=config.evaluation.every_episodes,
-            evaluate_steps=config.evaluation.every_steps,
-            evaluate_at_end=config.evaluation.at_end,
-            interim_episodes=config.evaluation.interim_episodes or config.evaluation.episodes,
-            final_episodes=config.evaluation.episodes,
-        ),
+        plan=plan,
         emulators=build_emulators(env, env.num_envs),
         stack=FrameStack(env.num_envs, env.size, env.stack),
-        actor=actor,
-        memory=ReplayMemory(
-            config.replay.capacity, (env.size, env.size), stack=env.stack, budget_bytes=config.replay.max_bytes
-        ),
+        actor=EpsilonGreedy(learner.q_values, len(ACTIONS)),
+        memory=memory,
         learner=learner,
         exploration=[np.random.default_rng(child) for child in stream(config.seed, "exploration").spawn(env.num_envs)],
         sampling=np.random.default_rng(stream(config.seed, "sampling")),
         seeds=stream(config.seed, "emulators").generate_state(env.num_envs).tolist(),
-        tracker=tracker,
-        checkpoints=Checkpoints(folder / "checkpoints", config.identity()),
-        evaluate=evaluation,
-        progress=progress,
+        recorder=Recorder(
+            plan=plan,
+            cadence=build_cadence(config.evaluation, config.tracking),
+            learner=learner,
+            memory=memory,
+            tracker=tracker,
+            progress=progress,
+            evaluate=partial(build_evaluator(env, config.evaluation), watched),
+            about=about,
+        ),
+        checkpoints=Checkpoints(folder / CHECKPOINTS, config.identity()),
         max_steps=config.budget.steps,
-        about=about,
     )

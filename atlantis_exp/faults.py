@@ -1,9 +1,20 @@
-"""Faults at run time that a person can act on."""
+"""What a person can act on: mistakes and faults that end a command with one line instead of a traceback."""
 
 
 class Fault(RuntimeError):
-    """Ends a command with one clear line and an exit code instead of a traceback; nothing committed is lost."""
+    """Ends a command with one clear line and an exit code; nothing committed is lost."""
 
     def __init__(self, message: str, exit_code: int = 1) -> None:
         super().__init__(message)
         self.exit_code = exit_code
+
+
+class RunFault(Fault):
+    """Ended a run at its last commit, from where the same command continues it."""
+
+
+class ConfigError(Fault, ValueError):
+    """A user's mistake, in one line that names the key and the nearest valid choice."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message, exit_code=2)

@@ -73,7 +73,7 @@ def scene(
     chosen: int | None,
     q_values: npt.NDArray[np.float32] | None,
 ) -> npt.NDArray[np.uint8]:
-    """A picture of a film: the (210, 160, 3) screen, doubled, and beside it who decides what, and why.
+    """A picture of a film: the (210, 160, 3) screen, doubled, and to its right who decides what, and why.
 
     A bar is empty for the action of the least value and full for that of the highest; without values there is none.
     """

@@ -16,8 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from atlantis_exp.build import build_learner, choose_device, count_update_flops
-from atlantis_exp.config import Config, ConfigError
+from atlantis_exp.build import build_learner, choose_device
+from atlantis_exp.config import Config
+from atlantis_exp.faults import ConfigError
 from benchmarks.composition import composed
 from benchmarks.contest import calls_per_second, print_results, print_table, take_turns
 
@@ -58,6 +59,12 @@ def update_of(config: Config) -> Callable[[], object]:
         np.full(batch_size, config.objective.gamma, np.float32),
     )
     return lambda: learner.update(*batch).cpu()  # waits for a GPU
+
+
+def flops_of(config: Config) -> int:
+    """The floating-point operations of an update of a learner."""
+    env = config.env
+    return build_learner(config).update_flops((env.stack, env.size, env.size), config.training.batch_size)
 
 
 def gemm_of(precision: str) -> Callable[[], None]:
@@ -104,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     for case in cases:
         config = case.config()
-        flops[f"gemm_{case.name}"], flops[case.name] = 2 * _SIDE**3, count_update_flops(config)
+        flops[f"gemm_{case.name}"], flops[case.name] = 2 * _SIDE**3, flops_of(config)
         turns[f"gemm_{case.name}"] = measured(gemm_of(case.precision), threads)
         update = update_of(config)
         turns[case.name] = measured(update, torch.get_num_threads())

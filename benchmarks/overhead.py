@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from atlantis_exp.tracking.journal import Journal, NullJournal, Tracker
+from atlantis_exp.runs.journal import Journal, NullJournal, Tracker
 from atlantis_exp.tracking.store import Publisher, Store
 from atlantis_exp.training.evaluation import Episode, Evaluation
 from atlantis_exp.training.trainer import Trainer
@@ -83,9 +83,9 @@ def training(tracked: bool, commit_seconds: float) -> Iterator[Measure[Turn]]:
         return journal
 
     with learning(config, tracker_of) as trainer:
-        tracker = Timed(trainer.tracker)
-        trainer.tracker = cast(Tracker, tracker)
-        trainer.evaluate = lambda *_: (_evaluation(), None)
+        tracker = Timed(trainer.recorder.tracker)
+        trainer.recorder.tracker = cast(Tracker, tracker)
+        trainer.recorder._evaluate = lambda *_: (_evaluation(), None)
         clocks = [
             time.pthread_getcpuclockid(thread.ident)
             for thread in threading.enumerate()

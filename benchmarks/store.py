@@ -9,34 +9,38 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from atlantis_exp.commands.app import check
-from atlantis_exp.commands.compare import compare
-from atlantis_exp.commands.report import report
-from atlantis_exp.commands.runs import Result, RunFolder
-from atlantis_exp.commands.sweeps import ledger
-from atlantis_exp.commands.sync import sync
-from atlantis_exp.config import CompareConfig, Config, ReportConfig, SyncConfig, to_dict
-from atlantis_exp.tracking.journal import Commit, commit_bytes, read_commit, write_file
-from atlantis_exp.tracking.store import Cursor, Store, small_files, standing
+from atlantis_exp.checking import to_dict
+from atlantis_exp.commands.app import Asked, Verb
+from atlantis_exp.commands.compare import VERB as COMPARE
+from atlantis_exp.commands.overrides import check
+from atlantis_exp.commands.report import VERB as REPORT
+from atlantis_exp.commands.sync import VERB as SYNC
+from atlantis_exp.runs.folder import Result, RunFolder, evaluation_at
+from atlantis_exp.runs.journal import Commit, commit_bytes, read_commit, write_file
+from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.sweep import ledger
+from atlantis_exp.tracking.store import Cursor, Store, files_digest, small_files
 from atlantis_exp.training.evaluation import Episode, Evaluation
+from benchmarks.composition import composed
 
 STEPS_PER_EPISODE = 1_600  # of random play; every 1,000 steps a journal has a line of 17 metrics
 MODELS = ("cnn", "resnet")
 
 
-def write_runs(outputs: Path, runs: int, episodes: int, distinct: int) -> list[Config]:
+def write_runs(outputs: Path, runs: int, episodes: int, distinct: int) -> list[Job]:
     """Write the folders of finished trainings, with `distinct` journals among them that the others share by links."""
-    configs = []
+    jobs = []
     journals: list[Path] = []
-    bases = [check("config", Config, [f"model={model}", f"paths.outputs={outputs}"])[0] for model in MODELS]
+    bases = [composed(f"model={model}", f"paths.outputs={outputs}") for model in MODELS]
     for number in range(runs):
         rng = np.random.default_rng(number)
         config = dataclasses.replace(bases[number % len(bases)], seed=number // len(bases))
-        configs.append(config)
-        folder = RunFolder(outputs / "runs" / config.run_name())
+        jobs.append(Job(config))
+        folder = RunFolder.of(config)
         folder.write_config(to_dict(config))
         journal = folder.path / "journal.jsonl"
         if number < distinct:
@@ -52,12 +56,12 @@ def write_runs(outputs: Path, runs: int, episodes: int, distinct: int) -> list[C
             for index, score in enumerate(100.0 * rng.integers(50, 500, size=100))
         ]
         evaluation = Evaluation(config.evaluation.epsilon, played)
-        table = folder.path / f"artifacts/evaluation/{steps:09d}.csv"
+        table = folder.artifact(evaluation_at(steps))
         table.parent.mkdir(parents=True)
-        table.write_text(evaluation.table())
+        table.write_text(evaluation.table().to_csv())
         counts = {"episodes": episodes, "frames": 3.0 * steps, "updates": steps / 16, "hours": 20.0}
         folder.write_result(Result("finished", steps, counts, evaluation.metrics(), evaluation.report()))
-    return configs
+    return jobs
 
 
 def write_journal(path: Path, episodes: int, rng: np.random.Generator) -> None:
@@ -92,14 +96,20 @@ def write_journal(path: Path, episodes: int, rng: np.random.Generator) -> None:
 _MEANS = {"mean_20": 20, "mean_100": 100, "best_100": 100}
 
 
+def work_of(verb: Verb[Any], *overrides: str) -> Callable[[], None]:
+    """The work that a command line of a verb asks for, without Hydra."""
+    (config,) = check(verb.name, verb.schema, overrides).values()
+    return verb.work(Asked(config, verb.name, overrides))
+
+
 def publish_nothing(outputs: Path) -> None:
     """Note in every run's folder that the local store has it."""
     address = Store(outputs).address
     for path in outputs.glob("runs/*/commit.json"):
         folder = path.parent
         if (commit := read_commit(folder)) is not None:
-            state = standing(small_files(folder, commit, is_server=False))
-            note = Cursor(address, commit.identity, "0" * 32, commit.offset, state)
+            digest = files_digest(small_files(folder, commit, is_server=False))
+            note = Cursor(address, commit.identity, "0" * 32, commit.offset, digest)
             write_file(folder / "published.json", json.dumps(dataclasses.asdict(note)).encode())
 
 
@@ -131,19 +141,19 @@ def main(arguments: Sequence[str] = ()) -> None:
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="store-", dir=".") as place:
         outputs = Path(place).resolve()
-        configs = write_runs(outputs, options.runs, options.episodes, options.distinct)
-        size = (outputs / "runs" / configs[0].run_name() / "journal.jsonl").stat().st_size
+        jobs = write_runs(outputs, options.runs, options.episodes, options.distinct)
+        size = (RunFolder.of(jobs[0].config).path / "journal.jsonl").stat().st_size
         of = f"paths.outputs={outputs}"
 
         def table() -> None:
-            with ledger(configs, ["seed=0,1"]):
+            with ledger(jobs, ["seed=0,1"]):
                 pass
 
         commands: dict[str, Callable[[], None]] = {
-            "compare": lambda: compare(check("compare", CompareConfig, [of, "tracking=none"])[0]),
+            "compare": lambda: work_of(COMPARE, of, "tracking=none")(),
             "sweep": table,
-            "report": lambda: report(check("report", ReportConfig, [of])[0]),
-            "sync": lambda: sync(check("sync", SyncConfig, [of])[0]),
+            "report": lambda: work_of(REPORT, of)(),
+            "sync": lambda: work_of(SYNC, of)(),
         }
         measure(table)  # which gives the runs their parent
         publish_nothing(outputs)

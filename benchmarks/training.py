@@ -22,7 +22,7 @@ from rich.console import Console
 
 from atlantis_exp.build import build_trainer
 from atlantis_exp.config import Config
-from atlantis_exp.tracking.journal import Journal, Tracker
+from atlantis_exp.runs.journal import Journal, Tracker
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Trainer
 from benchmarks.composition import composed

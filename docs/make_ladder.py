@@ -15,10 +15,10 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 from tables import RANDOM, Row, updated
 
-from atlantis_exp.commands.runs import RunFolder, all_runs
 from atlantis_exp.media import GREY
+from atlantis_exp.runs.folder import RunFolder, all_runs, evaluation_at
+from atlantis_exp.runs.journal import Tags, curve, read
 from atlantis_exp.statistics import interquartile_mean, interval, resample
-from atlantis_exp.tracking.journal import Tags, curve, read
 
 DATA = Path("docs/data/ladder.csv")
 COLUMNS = ("run", "command", "commit", "updates", "hours", "steps", "training", "evaluation")
@@ -50,7 +50,7 @@ def row_of(run: RunFolder) -> Row:
     points: dict[int, float] = {}
     for record in curve(run.path, ("score/mean_20",)):
         points.setdefault(record.step // EVERY * EVERY, record.values["score/mean_20"])
-    with (run.path / f"artifacts/evaluation/{run.result.steps:09d}.csv").open() as file:
+    with run.artifact(evaluation_at(run.result.steps)).open() as file:
         scores = [f"{float(episode['score']):.0f}" for episode in csv.DictReader(file)]
     values = (
         run.name,

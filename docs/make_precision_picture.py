@@ -10,9 +10,9 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from atlantis_exp.commands.runs import all_runs
 from atlantis_exp.media import BLUE, VERMILLION
-from atlantis_exp.tracking.journal import Metrics, read, read_commit
+from atlantis_exp.runs.folder import all_runs
+from atlantis_exp.runs.journal import Metrics, read, read_commit
 
 PANELS = {
     "score/mean_20": "score, mean of 20 episodes",

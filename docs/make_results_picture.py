@@ -12,9 +12,9 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from tables import RANDOM, updated
 
-from atlantis_exp.commands.runs import RunFolder, all_runs
 from atlantis_exp.media import BLUE, GREEN, GREY, VERMILLION
-from atlantis_exp.tracking.journal import Metrics, read, read_commit
+from atlantis_exp.runs.folder import RunFolder, all_runs
+from atlantis_exp.runs.journal import Metrics, read, read_commit
 
 TABLE = Path("docs/data/fast.csv")
 KEYS = {

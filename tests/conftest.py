@@ -1,27 +1,33 @@
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
+from uuid import uuid4
 
 import pytest
+from filelock import FileLock
 from hydra import compose, initialize_config_dir
 from hypothesis import settings
 from omegaconf import DictConfig
 from rich.console import Console
 
 from atlantis_exp.build import build_trainer
-from atlantis_exp.commands.app import CONF, checked
-from atlantis_exp.commands.runs import Result, RunFolder
-from atlantis_exp.config import Config, to_dict
-from atlantis_exp.tracking.journal import Journal
+from atlantis_exp.checking import to_dict
+from atlantis_exp.commands import main
+from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.config import Config
+from atlantis_exp.runs.folder import Result, RunFolder, evaluation_at
+from atlantis_exp.runs.journal import Journal
+from atlantis_exp.tracking.store import Store
 from atlantis_exp.training.evaluation import Episode, Evaluation
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Trainer
@@ -72,11 +78,80 @@ def answering() -> Callable[..., None]:
 
 
 @pytest.fixture(scope="session")
-def mlflow_server(answering: Callable[..., None]) -> Callable[[Path, int], Serving]:
+def mlflow_tables(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], None]:
+    """Puts a database with MLflow's tables into a folder that has none: `mlflow_tables(folder)`.
+
+    To make them takes seconds, to copy them does not: all of a session are copies of one, which its workers share.
+    """
+    own = tmp_path_factory.getbasetemp()
+    template = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "tables.db"
+
+    def made() -> None:
+        aside = tmp_path_factory.mktemp("tables") / "mlflow.db"
+        from mlflow import MlflowClient
+
+        MlflowClient(f"sqlite:///{aside}").get_experiment_by_name("atlantis")
+        aside.replace(template)
+
+    def put(folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / "mlflow.db").exists():
+            return
+        with FileLock(template.with_suffix(".lock")):
+            if not template.exists():
+                made()
+        aside = folder / f"{uuid4().hex}.db"
+        shutil.copyfile(template, aside)
+        with suppress(FileExistsError):  # another thread was faster
+            os.link(aside, folder / "mlflow.db")
+        aside.unlink()
+
+    return put
+
+
+_CONNECTION = Store.__dict__["_connection"]
+_connect = _CONNECTION.func
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _stores_have_tables(
+    tmp_path_factory: pytest.TempPathFactory, mlflow_tables: Callable[[Path], None]
+) -> Iterator[None]:
+    """Local stores of this process, under pytest's folder, find their tables made."""
+
+    def connect(store: Store) -> object:
+        with suppress(OSError):  # which the store itself is to meet
+            if store.is_local and store._root.is_relative_to(tmp_path_factory.getbasetemp()):
+                mlflow_tables(store._root)
+        return _connect(store)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(_CONNECTION, "func", connect)
+        yield
+
+
+@pytest.fixture
+def stores_without_tables(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stores make their own tables, as outside of tests."""
+    monkeypatch.setattr(_CONNECTION, "func", _connect)
+
+
+@pytest.fixture
+def outputs(tmp_path: Path, mlflow_tables: Callable[[Path], None]) -> Path:
+    """An outputs folder whose database has MLflow's tables, for commands in processes of their own."""
+    mlflow_tables(tmp_path / "outputs")
+    return tmp_path / "outputs"
+
+
+@pytest.fixture(scope="session")
+def mlflow_server(
+    answering: Callable[..., None], mlflow_tables: Callable[[Path], None]
+) -> Callable[[Path, int], Serving]:
     """A server on the store in a folder, which ends by SIGKILL."""
 
     @contextmanager
     def serving(folder: Path, port: int) -> Iterator[None]:
+        mlflow_tables(folder)
         files = ("--artifacts-destination", f"{folder}/artifacts")
         store = ("--backend-store-uri", f"sqlite:///{folder}/mlflow.db", *files)
         process = subprocess.Popen(
@@ -167,11 +242,24 @@ def recorded(tiny: Callable[..., Config]) -> Callable[..., Path]:
             for index, score in enumerate(scores)
         ]
         evaluation = Evaluation(config.evaluation.epsilon, episodes)
-        journal.artifact(f"evaluation/{steps:09d}.csv", evaluation.table().encode())
-        journal.state_dict()
-        journal.commit()
-        journal.status("FINISHED")
+        journal.artifact(evaluation_at(steps), evaluation.table().to_csv().encode())
+        journal.finish()
         folder.write_result(Result("finished", steps, {}, evaluation.metrics(), evaluation.report()))
         return folder.path
 
     return record
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """Runs a command line in this process and returns its exit code: `command("evaluate", "run=latest")`."""
+
+    def run(*words: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["atlantis_exp", *words])
+        try:
+            main()
+        except SystemExit as ended:
+            return int(str(ended.code))
+        return 0
+
+    return run

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from atlantis_exp import build
-from atlantis_exp.commands.cards import MOST_BYTES, build_exported_actor, read_card
+from atlantis_exp.sessions.cards import MOST_BYTES, build_exported_actor, read_card
 from atlantis_exp.training.actor import EpsilonGreedy
 
 REPOSITORY = Path(__file__).resolve().parents[1]

@@ -1,7 +1,11 @@
-"""One module a verb: overrides enter, a checked config is composed, built and called.
+"""One module a verb: its schema, its overrides and one call.
 
-Hydra and OmegaConf live here and nowhere else; what a verb does lives on the floors below.
+In: what a person typed. Out: checked values for the floors below. Hydra, OmegaConf and the command line live here and
+nowhere else; what a verb does lives in `sessions` and `comparison`.
 """
+
+import importlib
+import sys
 
 VERBS = {
     "train": "one run, from a composed config; the same command again continues or reports it (the default verb)",
@@ -18,3 +22,18 @@ VERBS = {
     "ui": "the MLflow UI on the local store",
 }
 """Each verb and what it does, as `--help` lists them."""
+
+
+def main() -> None:
+    """Run the verb that the command line names first; only its own module is imported."""
+    first, *rest = sys.argv[1:] or [""]
+    if first in VERBS:
+        verb, arguments = first, rest
+    elif first and "=" not in first and first[0] not in "-~+":
+        from atlantis_exp.checking import nearest
+
+        print(f"atlantis_exp: {first}: no such verb; {nearest(first, VERBS)}", file=sys.stderr)
+        sys.exit(2)
+    else:
+        verb, arguments = "train", sys.argv[1:]
+    importlib.import_module(f"atlantis_exp.commands.{verb.replace('-', '_')}").VERB.run(arguments)

@@ -1,31 +1,47 @@
 """`python -m atlantis_exp baseline`: a player without a network as a tracked run (report figures 1.4 and 1.5)."""
 
-from pathlib import Path
+from collections.abc import Callable
+from functools import partial
 
-from atlantis_exp.commands.app import run_verb
-from atlantis_exp.config import BaselineConfig, to_dict
+from pydantic.dataclasses import dataclass
 
-
-def baseline(config: BaselineConfig) -> None:
-    """Play, print the report's table, and record it all."""
-    from atlantis_exp.build import build_baseline, run_evaluation
-    from atlantis_exp.commands.runs import RunFolder, record_evaluation, settle
-    from atlantis_exp.commands.titles import baseline_title, labels
-    from atlantis_exp.media import run_colour
-    from atlantis_exp.training.progress import Progress
-
-    outputs = Path(config.paths.outputs)
-    settle(outputs)
-    folder = RunFolder(outputs / "runs" / config.run_name())
-    progress = Progress()
-    progress.say(f"{config.agent.name} player, {config.evaluation.episodes} episodes of {config.env.id}")
-    evaluation, video = run_evaluation(
-        build_baseline(config.agent), config.env, config.evaluation, config.evaluation.episodes, progress
-    )
-    shown = labels(baseline_title(config), run_colour(config.agent.name))
-    record_evaluation(folder, "baseline", to_dict(config), evaluation, video, config.tracking, outputs, shown)
+from atlantis_exp.checking import digest, to_dict
+from atlantis_exp.commands.app import Asked, Verb
+from atlantis_exp.config import STRICT, BaselineAgentConfig, EnvConfig, EvaluationConfig, PathsConfig, TrackingConfig
 
 
-def main() -> None:
-    """Compose and play."""
-    run_verb("baseline", BaselineConfig, baseline)
+@dataclass(config=STRICT, kw_only=True, frozen=True)
+class BaselineConfig:
+    """A tracked run of a player without a network."""
+
+    agent: BaselineAgentConfig
+    env: EnvConfig
+    evaluation: EvaluationConfig
+    tracking: TrackingConfig
+    paths: PathsConfig
+
+    def identity(self) -> str:
+        """Ten hexadecimal digits that are equal exactly for baselines with the same numbers."""
+        env = to_dict(self.env)
+        del env["workers"]
+        return digest({"agent": to_dict(self.agent), "env": env, "evaluation": to_dict(self.evaluation)})
+
+    def run_name(self) -> str:
+        """The player, its action where it has one, and the identity."""
+        action = f"{self.agent.action}" if self.agent.name == "constant" else ""
+        return f"{self.agent.name}{action}-{self.env.id.rsplit('/')[-1]}-{self.identity()}"
+
+    def title(self) -> str:
+        """The player, its game, and a few digits of its identity."""
+        action = f" {self.agent.action}" if self.agent.name == "constant" else ""
+        return f"{self.agent.name}{action} {self.env.id.rsplit('/')[-1]} {self.identity()[:6]}"
+
+
+def _work(asked: Asked[BaselineConfig]) -> Callable[[], None]:
+    from atlantis_exp.sessions.evaluating import play_baseline
+
+    config = asked.config
+    return partial(play_baseline, **vars(config), name=config.run_name(), title=config.title(), command=asked.command)
+
+
+VERB = Verb("baseline", BaselineConfig, _work)

@@ -1,85 +1,48 @@
-"""A job of a sweep, in whatever process its launcher has put it."""
+"""From what was typed for a training to a `Job`: above all, what people will call the run."""
 
-import os
-import signal
-import subprocess
-import sys
-import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
+import json
+from collections.abc import Sequence
 
-from atlantis_exp.commands.app import JOB_OF, job_of
-from atlantis_exp.commands.train import final_result, train, watch_of
-from atlantis_exp.config import Config, ConfigError
-from atlantis_exp.faults import Fault
+from atlantis_exp.checking import digest
+from atlantis_exp.commands.app import Asked
+from atlantis_exp.commands.overrides import read_override
+from atlantis_exp.config import Config
+from atlantis_exp.sessions.job import Job
 
-_OUTPUT = "output.txt"  # what a run in a process of its own printed
+_SAID = ("model", "sampler", "seed")  # by a title anyway
+_UNSAID = ("resume", "device", "threads", "compile", "tracking", "budget", "paths")  # no part of what is trained
+_BARE = ("experiment", "objective", "optimizer", "epsilon", "env")  # groups whose options speak for themselves
+_SPELLED = 4  # values at most; beyond them a few digits of their hash tell runs apart
 
 
-def train_job(config: Config) -> None:
-    """Train here, or, as a job of joblib's, in a process of its own: whatever ends it, the other jobs go on.
+def job_of(asked: Asked[Config]) -> Job:
+    """The training that was asked for."""
+    return Job(asked.config, words_of(asked.overrides), asked.overrides, asked.launcher)
 
-    Raises:
-        Fault: where the run fails; as the one line that a launcher can carry from machine to machine.
+
+def words_of(overrides: Sequence[str]) -> tuple[str, ...]:
+    """What a run's title says besides network, sampler and seed: chosen options, then changed values.
+
+    Told from what was typed alone: `experiment=fast objective.n_step=3` makes `fast n_step=3`. A key is as short as it
+    is clear, and a value reads the same however it was written: Hydra writes 1_000 as 1000 for a job of a sweep.
     """
-    if job_of() is None:
-        train(config)
-    elif job_of() == "joblib":
-        _train_apart(config)
-    else:
-        try:
-            with _kept_output(config) if job_of() == "ray" else nullcontext():
-                train(config)
-        except (ConfigError, Fault, OSError):
-            raise
-        except Exception as error:
-            traceback.print_exc()
-            raise Fault(f"run {config.run_name()}: {type(error).__name__}: {error}") from error
-
-
-@contextmanager
-def _kept_output(config: Config) -> Iterator[None]:
-    """What is printed goes to the run's folder, since Ray's own files of it are on whatever machine this is."""
-    from atlantis_exp.commands.runs import RunFolder
-
-    folder = RunFolder.of(config).path
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / _OUTPUT, "a", buffering=1) as output, redirect_stdout(output), redirect_stderr(output):
-        yield
-
-
-def _train_apart(config: Config) -> None:
-    from atlantis_exp.commands.runs import RunFolder
-    from atlantis_exp.tracking.journal import Journal, JournalError
-
-    folder = RunFolder.of(config)
-    if config.resume != "never" and final_result(config, folder) is not None:
-        return
-    if not watch_of(folder)():
-        raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
-    folder.path.mkdir(parents=True, exist_ok=True)
-    with open(folder.path / _OUTPUT, "a+") as output:
-        start = output.tell()
-        code = subprocess.run(
-            [sys.executable, "-m", "atlantis_exp", "train", *sys.argv[1:]],
-            env={**os.environ, JOB_OF: "apart"},
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=output,
-            check=False,
-        ).returncode
-        if folder.parent and not RunFolder(folder.parent).is_held:
-            os._exit(code)  # the process that this worker works for was killed: there is nobody to tell
-        output.seek(start)
-        said = output.read().splitlines()
-    if code == 0:
-        return
-    reason = (
-        f"killed by {signal.Signals(-code).name}"
-        if code < 0
-        else (said or ["it said nothing"])[-1].removeprefix("atlantis_exp: ")
-    )
-    if code < 0 or (code == 1 and folder.state != "failed"):  # it could not say so itself
-        with suppress(Fault, JournalError), folder.held():
-            Journal(folder.path).status("KILLED" if code < 0 else "FAILED", reason)
-    raise Fault(f"run {folder.name}: {reason}; see {folder.path / _OUTPUT}", exit_code=code if code > 0 else 128 - code)
+    options: dict[str, str] = {}
+    values: dict[str, str] = {}
+    for text in overrides:
+        override = read_override(text)
+        key, value = override.get_key_element().lstrip("+"), override.value()
+        word = "" if override.is_delete() else value if isinstance(value, str) else json.dumps(value)
+        root = key.lstrip("~").split(".")[0]
+        if key in _SAID or root in _UNSAID or key in ("env.workers",) or word == "none":
+            continue
+        if key in _BARE:
+            options[key] = word
+        elif "." not in key or "@" in key:
+            options[key] = f"{key}={word}"
+        else:
+            values[key] = word
+    if len(values) > _SPELLED:
+        return (*options.values(), digest(values)[:6])
+    last = [key.rsplit(".", 1)[-1] for key in values]
+    short = {key: name if last.count(name) == 1 else key for key, name in zip(values, last, strict=True)}
+    return (*options.values(), *(f"{short[key]}={value}" if value else key for key, value in values.items()))

@@ -1,98 +1,32 @@
 """`python -m atlantis_exp play player=NAME`: a person at the keyboard as a tracked run."""
 
-from itertools import count
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from functools import partial
+from typing import Annotated
 
-from atlantis_exp.commands.app import run_verb
-from atlantis_exp.config import PlayConfig, to_dict
-from atlantis_exp.faults import Fault
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
-if TYPE_CHECKING:
-    from atlantis_exp.game.preprocessing import Pixels
-
-
-class Window:
-    """A pygame window that shows screens at the game's speed and says which action the keys mean.
-
-    Raises:
-        Fault: where pygame is not installed or there is no screen.
-    """
-
-    def __init__(self, steps_per_second: float, scale: int) -> None:
-        try:
-            import pygame
-        except ImportError:
-            raise Fault("play needs pygame: pip install 'atlantis-exp[play]'") from None
-        self._pygame = pygame
-        try:
-            pygame.display.init()
-            self._surface = pygame.display.set_mode((160 * scale, 210 * scale))
-        except pygame.error as error:
-            raise Fault(f"play needs a screen: {error}") from None
-        pygame.display.set_caption("Atlantis: left, up, right fire a gun each; a gun fires once a press")
-        # In the order of precedence: ALE's actions 3 LEFTFIRE, 2 RIGHTFIRE, 1 FIRE, which is the gun in the middle.
-        self._actions = {pygame.K_LEFT: 3, pygame.K_RIGHT: 2, pygame.K_UP: 1, pygame.K_SPACE: 1}
-        self._clock = pygame.time.Clock()
-        self._steps_per_second = steps_per_second
-        self.closed = False
-
-    def choose(self, screen: "Pixels") -> int:
-        """Show a screen, (210, 160, 3) uint8, for one step; the action of the keys pressed meanwhile or still."""
-        pygame = self._pygame
-        picture = pygame.surfarray.make_surface(screen.swapaxes(0, 1))
-        self._surface.blit(pygame.transform.scale(picture, self._surface.get_size()), (0, 0))
-        pygame.display.flip()
-        self._clock.tick(self._steps_per_second)
-        events = pygame.event.get()
-        self.closed = self.closed or any(event.type == pygame.QUIT for event in events)
-        tapped = {event.key for event in events if event.type == pygame.KEYDOWN}
-        held = pygame.key.get_pressed()
-        return next((action for key, action in self._actions.items() if key in tapped or held[key]), 0)
-
-    def close(self) -> None:
-        """Close the window."""
-        self._pygame.display.quit()
+from atlantis_exp.commands.app import Asked, Verb
+from atlantis_exp.config import STRICT, EnvConfig, EvaluationConfig, PathsConfig, TrackingConfig
 
 
-def play(config: PlayConfig) -> None:
-    """Let a person play, print the report's table, and record it all.
+@dataclass(config=STRICT, kw_only=True, frozen=True)
+class PlayConfig:
+    """A tracked run of a person."""
 
-    The game runs at its 60 frames a second; picture and keys follow its steps, as for the networks.
-    """
-    from atlantis_exp.build import build_person, run_evaluation
-    from atlantis_exp.commands.runs import RunFolder, record_evaluation, settle
-    from atlantis_exp.commands.titles import labels
-    from atlantis_exp.media import run_colour
-    from atlantis_exp.training.evaluation import Stopped
-    from atlantis_exp.training.progress import Progress
-
-    outputs = Path(config.paths.outputs)
-    settle(outputs)
-    frameskip = config.env.frameskip
-    frames = frameskip if isinstance(frameskip, int) else (frameskip[0] + frameskip[1] - 1) / 2  # a step, on average
-    window = Window(60 / frames, config.scale)
-    actor, emulators = build_person(config.env, window.choose)
-    try:
-        evaluation, video = run_evaluation(
-            actor,
-            config.env,
-            config.evaluation,
-            config.evaluation.episodes,
-            Progress(),
-            lambda: window.closed,
-            emulators,
-        )
-    except Stopped:
-        raise Fault("the window was closed before the last episode ended; nothing is recorded") from None
-    finally:
-        window.close()
-    names = (f"human-{config.player}-{config.env.id.rsplit('/')[-1]}-{number}" for number in count(1))
-    folder = RunFolder(next(path for name in names if not (path := outputs / "runs" / name).exists()))
-    shown = labels(folder.name, run_colour("human"))
-    record_evaluation(folder, "human", to_dict(config), evaluation, video, config.tracking, outputs, shown)
+    player: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")]
+    scale: Annotated[int, Field(ge=1, le=10)]  # window pixels a screen pixel
+    env: EnvConfig
+    evaluation: EvaluationConfig
+    tracking: TrackingConfig
+    paths: PathsConfig
 
 
-def main() -> None:
-    """Compose and play."""
-    run_verb("play", PlayConfig, play)
+def _work(asked: Asked[PlayConfig]) -> Callable[[], None]:
+    from atlantis_exp.sessions.evaluating import play
+
+    return partial(play, **vars(asked.config), command=asked.command)
+
+
+VERB = Verb("play", PlayConfig, _work)

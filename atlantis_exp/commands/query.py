@@ -1,35 +1,25 @@
 """`python -m atlantis_exp query`: what the environment is (report figures 1.1 to 1.3)."""
 
-import warnings
+from collections.abc import Callable
+from functools import partial
 
-from atlantis_exp.commands.app import run_verb
-from atlantis_exp.config import QueryConfig
+from pydantic.dataclasses import dataclass
 
-
-def query(config: QueryConfig) -> None:
-    """Print the environment's spaces, limits and rewards as the report does, then what this config makes of them."""
-    from atlantis_exp.game.emulator import query_environment
-
-    env = config.env
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Gymnasium calls the report's environment out of date
-        answers = query_environment(env.id)
-    frames = env.frameskip if isinstance(env.frameskip, int) else f"{env.frameskip[0]} to {env.frameskip[1] - 1}"
-    up, right, down, left = env.crop
-    print(f"Action Space: {answers['action_space']}")
-    print(f"possible actions: {answers['possible_actions']}")
-    print(f"Observation Space: {answers['observation_space']}")
-    print(f"Max Episode Steps: {answers['max_episode_steps']}")
-    print(f"Nondeterministic: {answers['nondeterministic']}")
-    print(f"Reward Range: {answers['reward_range']}")
-    print(f"Reward Threshold: {answers['reward_threshold']}")
-    print(f"\n{env.id} in this config")
-    print(f"frames a step: {frames}, of which each repeats the action before it with probability {env.sticky}")
-    print(f"an episode ends after: {env.max_steps or 'any number of'} steps, {env.max_frames} frames")
-    print(f"observation: rows {up}-{down - 1}, columns {left}-{right - 1}, grey, at {env.size}x{env.size} pixels")
-    print(f"state: {env.stack} observations")
+from atlantis_exp.commands.app import Asked, Verb
+from atlantis_exp.config import STRICT, EnvConfig
 
 
-def main() -> None:
-    """Compose and query."""
-    run_verb("query", QueryConfig, query)
+@dataclass(config=STRICT, kw_only=True, frozen=True)
+class QueryConfig:
+    """The environment query of report figures 1.1 to 1.3."""
+
+    env: EnvConfig
+
+
+def _work(asked: Asked[QueryConfig]) -> Callable[[], None]:
+    from atlantis_exp.sessions.querying import query
+
+    return partial(query, env=asked.config.env)
+
+
+VERB = Verb("query", QueryConfig, _work)

@@ -4,14 +4,15 @@ import math
 from collections.abc import Mapping, Sequence
 
 from hydra.core.override_parser.types import Glob, IntervalSweep, RangeSweep
-from optuna import Trial
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
-from atlantis_exp.commands.app import check, read_override
-from atlantis_exp.config import Config, ConfigError
-
-Space = Mapping[str, CategoricalDistribution | FloatDistribution | IntDistribution]
-"""The distribution of each key; a choice's values are texts, as an override has them."""
+from atlantis_exp.commands.app import Asked
+from atlantis_exp.commands.jobs import job_of
+from atlantis_exp.commands.overrides import check, read_override
+from atlantis_exp.config import Config
+from atlantis_exp.faults import ConfigError
+from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.space import Space
 
 _CORNERS = 32  # configs that are composed before a search starts, at 0.1 s each; a larger space is checked by its edges
 
@@ -55,7 +56,7 @@ def _read(key: str, text: str, closed: set[str]) -> CategoricalDistribution | Fl
         raise ConfigError(f"{key}={text}: {error}") from None
 
 
-def check_space(space: Space, overrides: Sequence[str]) -> Config:
+def check_space(space: Space, overrides: Sequence[str]) -> Job:
     """Compose the configs at the corners of a space; returns the first of them.
 
     Raises:
@@ -63,27 +64,16 @@ def check_space(space: Space, overrides: Sequence[str]) -> Config:
     """
     fixed = {text.split("=")[0] for text in overrides}
     if twice := sorted(fixed & space.keys()):
-        raise ConfigError(f"{twice[0]}: has one value and is to be searched; leave one of them away")
+        raise ConfigError(f"{twice[0]}: has one value and is to be searched; drop one of them")
     ends = {
         key: drawn.choices if isinstance(drawn, CategoricalDistribution) else (drawn.low, drawn.high)
         for key, drawn in space.items()
     }
     is_small = math.prod(map(len, ends.values())) <= _CORNERS
-    corners: list[Config] = []
+    corners: dict[tuple[str, ...], Config] = {}
     for varied in [None] if is_small else ends:
         chosen = {key: end if varied in (None, key) else end[:1] for key, end in ends.items()}
         swept = [f"{key}={','.join(map(str, end))}" for key, end in chosen.items()]
-        corners += check("config", Config, ["-m", *overrides, *swept])
-    return corners[0]
-
-
-def suggest(trial: Trial, space: Space) -> None:
-    """Draw a trial's values; those that it has been given already stay."""
-    for key, drawn in space.items():
-        match drawn:
-            case CategoricalDistribution():
-                trial.suggest_categorical(key, drawn.choices)
-            case IntDistribution():
-                trial.suggest_int(key, drawn.low, drawn.high, step=drawn.step, log=drawn.log)
-            case FloatDistribution():
-                trial.suggest_float(key, drawn.low, drawn.high, step=drawn.step, log=drawn.log)
+        corners |= check("config", Config, ["-m", *overrides, *swept])
+    texts, config = next(iter(corners.items()))
+    return job_of(Asked(config, "train", texts))

@@ -1,131 +1,48 @@
 """`python -m atlantis_exp sync`: run folders into an MLflow store, to a server, or from one into folders here."""
 
-import sys
-import time
-from collections import Counter
-from collections.abc import Iterable, Iterator
-from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from functools import partial
+from typing import Annotated
 
-from atlantis_exp.commands.app import run_verb
-from atlantis_exp.config import SyncConfig
-from atlantis_exp.faults import Fault
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
-if TYPE_CHECKING:
-    from atlantis_exp.tracking.store import Store
-
-_CHANGES = ("brought", "published")
+from atlantis_exp.checking import check_server, seconds
+from atlantis_exp.commands.app import Asked, Verb
+from atlantis_exp.config import STRICT, Count, PathsConfig, TrackingConfig
+from atlantis_exp.faults import ConfigError
 
 
-class Look(NamedTuple):
-    """What became of one run, and why where that is no matter of course."""
+@dataclass(config=STRICT, kw_only=True, frozen=True)
+class SyncConfig:
+    """Run folders and an MLflow store or server, brought up to each other."""
 
-    outcome: str
-    run: str
-    reason: str = ""
+    every: str | Count | None  # time between two looks, a number alone in seconds; null: one look
+    to: str | None  # a server's address: this one instead of the store that `tracking` names
+    from_: Annotated[str | None, Field(alias="from")]  # a server's address: its runs come here
+    tracking: TrackingConfig
+    paths: PathsConfig
 
+    def __post_init__(self) -> None:
+        check_server("to", self.to)
+        check_server("from", self.from_)
+        if self.to and self.from_:
+            raise ConfigError(f"from={self.from_}: goes the other way than to={self.to}; choose one")
+        if self.tracking.name == "none":
+            raise ConfigError("tracking=none: names no store to bring up to date; choose tracking=mlflow or server")
+        if self.seconds == 0:
+            raise ConfigError(f"every={self.every}: no time; write it as in 30s, 10min or 1h30m")
 
-def sync(config: SyncConfig) -> None:
-    """Bring runs and store up to each other, once or until interrupted; print a line a run that changed, and counts.
-
-    Raises:
-        Fault: where the store cannot be reached or a run failed; with `every` that is said, and tried again.
-    """
-    from atlantis_exp.tracking.store import Store
-
-    outputs = Path(config.paths.outputs)
-    store = Store(outputs, config.tracking.experiment, config.to or config.tracking.uri)
-    source = Store(outputs, config.tracking.experiment, config.from_) if config.from_ else None
-    is_first = True
-    try:
-        while True:
-            try:
-                if source is not None:
-                    _tell(f"from {source.uri}", _bring_all(outputs, source), is_first)
-                _tell(f"to {store.uri}", _publish_all(outputs, store, only_brought=source is not None), is_first)
-            except Fault as fault:
-                if config.seconds is None:
-                    raise
-                print(f"atlantis_exp: {fault}; looking again in {config.every}", file=sys.stderr, flush=True)
-            if config.seconds is None:
-                return
-            is_first = False
-            time.sleep(config.seconds)
-    except KeyboardInterrupt:
-        sys.exit(130)  # 128 + SIGINT; whatever has arrived is noted
+    @property
+    def seconds(self) -> int | None:
+        """`every` in seconds, 0 where it is not readable."""
+        return None if self.every is None else seconds(self.every)
 
 
-def _tell(way: str, looks: Iterable[Look], is_first: bool) -> None:
-    """Print what became of runs; counts only at first and where something did. Raises: Fault."""
-    counts: Counter[str] = Counter()
-    for outcome, run, reason in looks:
-        counts[outcome] += 1
-        if reason:
-            print(f"atlantis_exp: {run}: {outcome}: {reason}", file=sys.stderr, flush=True)
-        elif outcome in _CHANGES:
-            print(f"  {outcome:12}{run}", flush=True)
-    if is_first or any(outcome in counts for outcome in (*_CHANGES, "failed")):
-        listed = ", ".join(f"{count} {outcome}" for outcome, count in sorted(counts.items()))
-        print(f"{way}: {counts.total()} runs{': ' if listed else ''}{listed}", flush=True)
-    if counts["failed"]:
-        raise Fault(f"{way}: {counts['failed']} of {counts.total()} runs failed")
+def _work(asked: Asked[SyncConfig]) -> Callable[[], None]:
+    from atlantis_exp.sessions.syncing import sync
+
+    return partial(sync, **vars(asked.config), seconds=asked.config.seconds)
 
 
-def _publish_all(outputs: Path, store: "Store", only_brought: bool) -> Iterator[Look]:
-    from atlantis_exp.tracking.store import brought, publish
-
-    for path in sorted(
-        outputs.glob("*/*/commit.json"), reverse=True
-    ):  # sweeps before runs, which would take them along
-        folder = path.parent
-        run = str(folder.relative_to(outputs))
-        try:
-            if only_brought and brought(folder) is None:
-                continue
-            yield Look("published" if publish(folder, store, home=False) else "up to date", run)
-        except Exception as error:
-            yield Look("failed", run, _reason(error, store))
-
-
-def _bring_all(outputs: Path, source: "Store") -> Iterator[Look]:
-    from atlantis_exp.commands.runs import RunFolder
-    from atlantis_exp.tracking.travel import bring, is_here, place
-
-    try:
-        runs = sorted(source.runs(), key=lambda run: run.folder.parts[-2:], reverse=True)
-    except Exception as error:
-        raise Fault(f"{source.uri} cannot be reached: {_first_line(error)}") from None
-    listed = {run.run_id for run in runs}
-    for run in runs:
-        try:
-            folder = place(run, outputs)
-            if is_here(folder, run):
-                yield Look("as here", run.name)
-                continue
-            with RunFolder(folder).held():
-                outcome = bring(run, folder, source, listed)
-            reason = f"{folder} is another run, which stays" if outcome == "other" else ""
-            yield Look(outcome, str(folder.relative_to(outputs)), reason)
-        except Fault as fault:
-            yield Look("held", run.name, str(fault))
-        except Exception as error:
-            yield Look("failed", run.name, _reason(error, source))
-
-
-def _reason(error: Exception, store: "Store") -> str:
-    """What went wrong with one run. Raises: Fault where it is the store that did."""
-    if not isinstance(error, ValueError):  # which is what a run's own files raise
-        try:
-            store.client.get_experiment(store.experiment_id)
-        except Exception as fault:
-            raise Fault(f"{store.uri} cannot be reached: {_first_line(fault)}") from None
-    return _first_line(error)
-
-
-def _first_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}".partition("\n")[0]
-
-
-def main() -> None:
-    """Compose and bring up to date."""
-    run_verb("sync", SyncConfig, sync)
+VERB = Verb("sync", SyncConfig, _work)

@@ -1,34 +1,28 @@
 """`python -m atlantis_exp ui`: the MLflow UI on the local store."""
 
-import os
-import socket
-import sys
-from pathlib import Path
+from collections.abc import Callable
+from functools import partial
+from typing import Annotated
 
-from atlantis_exp.commands.app import run_verb
-from atlantis_exp.config import UiConfig
-from atlantis_exp.faults import Fault
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
-
-def ui(config: UiConfig) -> None:
-    """Serve the store on 127.0.0.1 until interrupted; prints the address that shows the runs."""
-    from atlantis_exp.tracking.store import Store
-    from atlantis_exp.tracking.views import START, address
-
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server will: a port just left is free
-        try:
-            probe.bind(("127.0.0.1", config.port))
-        except OSError as error:
-            raise Fault(f"port={config.port}: {error.strerror}; choose another, as in port=5001") from None
-    store = Store(Path(config.paths.outputs))
-    store.prepare()
-    print(f"MLflow UI: {address(f'http://127.0.0.1:{config.port}', store.experiment_id, START)}", flush=True)
-    os.environ["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] = "false"  # ten processes otherwise
-    arguments = ["server", "--host", "127.0.0.1", "--port", str(config.port), "--workers", "1"]
-    os.execv(sys.executable, [sys.executable, "-m", "mlflow", *arguments, "--backend-store-uri", store.uri])
+from atlantis_exp.commands.app import Asked, Verb
+from atlantis_exp.config import STRICT, PathsConfig
 
 
-def main() -> None:
-    """Compose and serve."""
-    run_verb("ui", UiConfig, ui)
+@dataclass(config=STRICT, kw_only=True, frozen=True)
+class UiConfig:
+    """The MLflow UI on the local store."""
+
+    port: Annotated[int, Field(ge=1024, le=65535)]
+    paths: PathsConfig
+
+
+def _work(asked: Asked[UiConfig]) -> Callable[[], None]:
+    from atlantis_exp.sessions.serving import serve
+
+    return partial(serve, **vars(asked.config))
+
+
+VERB = Verb("ui", UiConfig, _work)

@@ -1,4 +1,5 @@
-"""Finished run folders enter; tables, a verdict, figures and a page that shows them leave.
+"""Which group of runs is better, by how much, how surely.
 
-Every number drawn or written stands in a table. Knows no torch, no Hydra and no MLflow: run folders are the truth.
+In: finished run folders, which are the truth. Out: tables, a verdict, figures and a page; every number drawn or written
+is in a table. It must not know torch, Hydra or MLflow.
 """

@@ -1,6 +1,5 @@
 """Run folders to runs that can be compared; what cannot be is named with its reason."""
 
-import csv
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,8 +11,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from atlantis_exp.config import Config, ConfigError, flatten, nearest, parse, to_dict
-from atlantis_exp.tracking.journal import Metrics, Tags, curve, read, read_commit
+from atlantis_exp.checking import flatten, nearest, parse, to_dict
+from atlantis_exp.config import Config
+from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.runs.episodes import EpisodeTable
+from atlantis_exp.runs.folder import EVALUATION, RESULT, RunFolder, evaluation_at
+from atlantis_exp.runs.journal import Metrics, Tags, curve, read
 
 Array = npt.NDArray[np.float64]
 
@@ -36,17 +39,6 @@ _PLAYERS = ("agent", "player")  # the config's key of what has no network: a bas
 
 
 @dataclass(frozen=True)
-class Episodes:
-    """Evaluated episodes, one row each."""
-
-    scores: Array
-    steps: Array
-    truncated: Array  # 1 where the time cap ended it
-    actions: tuple[str, ...]
-    counts: Array  # steps, (episodes, actions, 2): chosen by the network, by chance
-
-
-@dataclass(frozen=True)
 class Training:
     """A finished training: its config, its learning curve and its evaluation after the last step."""
 
@@ -54,7 +46,7 @@ class Training:
     config: dict[str, Any]  # dotted keys; `evaluation.epsilon` is that of the evaluation taken
     science: dict[str, Any]  # the dotted keys that decide its numbers
     curve: dict[str, Array]  # frames, hours, flops (where recorded), epsilon, score (mean of the last 100 episodes)
-    episodes: Episodes
+    episodes: EpisodeTable
 
 
 @dataclass(frozen=True)
@@ -63,7 +55,7 @@ class Player:
 
     name: str
     config: dict[str, Any]  # dotted keys
-    episodes: Episodes
+    episodes: EpisodeTable
 
 
 @dataclass
@@ -87,20 +79,20 @@ def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None
     """
     evaluations = _evaluations(outputs)
     gathered = Gathered()
-    for folder in sorted(path for path in (outputs / "runs").glob("*") if path.is_dir()):
+    for folder in [RunFolder(path) for path in sorted((outputs / "runs").glob("*")) if path.is_dir()]:
         if runs and not any(fnmatchcase(folder.name, f"{pattern}*") for pattern in runs):
             continue
         try:
             tree = _config(folder)
             if any(key in tree for key in _PLAYERS):
                 gathered.players.append(
-                    Player(folder.name, flatten(tree), _episodes(folder / "artifacts/evaluation/episodes.csv"))
+                    Player(folder.name, flatten(tree), EpisodeTable.read(folder.artifact(EVALUATION)))
                 )
                 continue
             gathered.trainings.append(_training(folder, parse(Config, tree), evaluations[folder.name], epsilon))
         except _Unusable as error:
             gathered.skipped[folder.name] = str(error)
-        except (ValueError, KeyError, TypeError, OSError) as error:
+        except (Fault, ValueError, KeyError, TypeError, OSError) as error:
             gathered.skipped[folder.name] = f"broken: {error}"
     return gathered
 
@@ -138,7 +130,7 @@ def group(trainings: Iterable[Training], by: Sequence[str]) -> dict[str, list[Tr
 
 
 def resolve(key: str, config: Mapping[str, Any]) -> str:
-    """The dotted key that a short one stands for in a config, empty if there is none: `model` for `model.name`."""
+    """The dotted key that a short one means in a config, empty if there is none: `model` for `model.name`."""
     return next((name for name in (key, f"{key}.name", f"{key}.id") if name in config), "")
 
 
@@ -179,34 +171,37 @@ def _spellings(value: Any) -> tuple[str, str]:
     return str(value), json.dumps(value)
 
 
-def _config(folder: Path) -> dict[str, Any]:
+def _config(folder: RunFolder) -> dict[str, Any]:
     """The config of a folder that holds a finished run of ours."""
     if "~" in folder.name:
         raise _Unusable("put aside by resume=never")
-    try:
-        tree = json.loads((folder / "config.json").read_bytes())
-    except FileNotFoundError:
-        raise _Unusable("foreign: it has no config.json") from None
-    if not isinstance(tree, dict) or not any(key in tree for key in ("model", *_PLAYERS)):
+    if not folder.has_started:
+        raise _Unusable("foreign: it has no config.json")
+    tree = folder.config
+    if not any(key in tree for key in ("model", *_PLAYERS)):
         raise _Unusable("foreign: its config.json is not one of ours")
-    if not (folder / "result.json").exists():
+    if folder.result is None:
         raise _Unusable("unfinished: the command that started it continues it")
     return tree
 
 
 def _training(
-    folder: Path, config: Config, evaluations: Sequence[tuple[int, dict[str, Any], Path]], epsilon: float | None
+    folder: RunFolder,
+    config: Config,
+    evaluations: Sequence[tuple[int, dict[str, Any], RunFolder]],
+    epsilon: float | None,
 ) -> Training:
-    points = np.array([[record.values[key] for key in _CURVE.values()] for record in curve(folder, _POINT)])
+    points = np.array([[record.values[key] for key in _CURVE.values()] for record in curve(folder.path, _POINT)])
     arrays = dict(zip(_CURVE, points.T, strict=True)) if len(points) else {}
-    if (updates := arrays.pop("updates", None)) is not None and (flops := _flops_per_update(folder)) is not None:
+    if (updates := arrays.pop("updates", None)) is not None and (flops := _flops_per_update(folder.path)) is not None:
         arrays["flops"] = updates * flops
 
-    steps = json.loads((folder / "result.json").read_bytes())["steps"]
-    tables = [(config.evaluation.epsilon, folder / f"artifacts/evaluation/{steps:09d}.csv")]
+    assert folder.result is not None
+    steps = folder.result.steps
+    tables = [(config.evaluation.epsilon, folder.artifact(evaluation_at(steps)))]
     tables += [
-        (facts["evaluation"]["epsilon"], path / "artifacts/evaluation/episodes.csv")
-        for _, facts, path in sorted(evaluations, key=lambda evaluation: evaluation[0])
+        (facts["evaluation"]["epsilon"], run.artifact(EVALUATION))
+        for _, facts, run in sorted(evaluations, key=lambda evaluation: evaluation[0])
         if facts["step"] == steps
     ]
     tables = [(value, path) for value, path in tables if path.exists() and epsilon in (None, value)]
@@ -217,7 +212,7 @@ def _training(
     science = config.science()
     science["phase"] = {str(index): phase for index, phase in enumerate(science["phase"])}
     leaves = flatten(to_dict(config)) | {"evaluation.epsilon": taken}
-    return Training(folder.name, leaves, flatten(science), arrays, _episodes(path))
+    return Training(folder.name, leaves, flatten(science), arrays, EpisodeTable.read(path))
 
 
 def _flops_per_update(folder: Path) -> float | None:
@@ -229,30 +224,15 @@ def _flops_per_update(folder: Path) -> float | None:
     return None
 
 
-def _evaluations(outputs: Path) -> dict[str, list[tuple[int, dict[str, Any], Path]]]:
+def _evaluations(outputs: Path) -> dict[str, list[tuple[int, dict[str, Any], RunFolder]]]:
     """The finished runs of the verb `evaluate` by the run that they evaluate: when, with which facts, where."""
-    found: dict[str, list[tuple[int, dict[str, Any], Path]]] = defaultdict(list)
-    for path in sorted((outputs / "evaluations").glob("*/result.json")):
+    found: dict[str, list[tuple[int, dict[str, Any], RunFolder]]] = defaultdict(list)
+    for path in sorted((outputs / "evaluations").glob(f"*/{RESULT}")):
+        folder = RunFolder(path.parent)
         try:
-            facts, commit = json.loads((path.parent / "config.json").read_bytes()), read_commit(path.parent)
+            facts, commit = folder.config, folder.commit
             if commit is not None:
-                found[facts["run"]].append((commit.updated, facts, path.parent))
-        except (ValueError, KeyError, TypeError, OSError):
+                found[facts["run"]].append((commit.updated, facts, folder))
+        except (Fault, ValueError, KeyError, TypeError, OSError):
             continue  # what it evaluates cannot be told
     return found
-
-
-def _episodes(path: Path) -> Episodes:
-    with open(path, newline="") as file:
-        rows = list(csv.DictReader(file))
-    if not rows:
-        raise ValueError(f"{path} has no episode")
-    actions = tuple(name.removesuffix("_random") for name in rows[0] if name.endswith("_random"))
-    if not actions:
-        raise _Unusable(f"{path} does not say who chose the actions: play it again")
-    chance = np.array([[float(row[f"{action}_random"]) for action in actions] for row in rows])
-    both = np.array([[float(row[action]) for action in actions] for row in rows])
-    scores, steps, truncated = (
-        np.array([float(row[name]) for row in rows]) for name in ("score", "steps", "truncated")
-    )
-    return Episodes(scores, steps, truncated, actions, np.stack((both - chance, chance), axis=2))

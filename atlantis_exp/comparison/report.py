@@ -1,4 +1,4 @@
-"""Comparison to page: one HTML file that needs nothing else, with the tables beside it as CSV."""
+"""Comparison to page: one HTML file that needs nothing else, and its tables as CSV."""
 
 from collections.abc import Mapping
 from importlib.resources import files

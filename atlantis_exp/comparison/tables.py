@@ -1,4 +1,4 @@
-"""Runs to tables and a verdict: every number that a figure or the page shows stands in one of the tables."""
+"""Runs to tables and a verdict: every number that a figure or the page shows is in one of the tables."""
 
 import csv
 import io
@@ -76,8 +76,8 @@ def compare(gathered: Gathered, groups: Groups, by: Sequence[str], resamples: in
         "profile": _profile(groups, samples),
         "actions": [row for label, runs in groups.items() for row in _actions(label, runs)],
         "episodes": [row for label, runs in groups.items() for training in runs for row in _episodes(label, training)],
-        "references": [_measured(player) for player in players] + published("scores"),
-        "published_curves": [row for row in published("curves") if row["frames"] <= frames],
+        "references": [_measured(player) for player in players] + literature("scores"),
+        "published_curves": [row for row in literature("curves") if row["frames"] <= frames],
         "skipped": [{"run": name, "reason": reason} for name, reason in gathered.skipped.items()],
     }
     notes = _notes(groups, by, views, evaluation, random_line(tables["references"]), frames)
@@ -100,7 +100,7 @@ def to_csv(table: Table) -> str:
     return text.getvalue()
 
 
-def published(name: str) -> Table:
+def literature(name: str) -> Table:
     """The published `scores` (players and algorithms) or learning `curves` that ship with the package, with sources."""
     text = (files("atlantis_exp.comparison") / f"published_{name}.csv").read_text("utf-8")
     table: Table = list(csv.DictReader(io.StringIO(text)))
@@ -367,7 +367,7 @@ def _notes(
         ]
     if random_player["protocol"].startswith("published"):
         notes.append(
-            "No random player was measured under these settings, so a published one stands for it; "
+            "No random player was measured under these settings, so a published one takes its place; "
             "python -m atlantis_exp baseline with the same env measures one."
         )
     if frames <= EARLY_FRAMES and any(row["iqm"] < random_player["score"] for row in evaluation):
@@ -377,10 +377,10 @@ def _notes(
 
 def early_dqn() -> str:
     """Why below random is no bug, from the published learning curves."""
-    at = [row for row in published("curves") if row["name"].startswith("DQN") and row["frames"] == 5e6]
+    at = [row for row in literature("curves") if row["name"].startswith("DQN") and row["frames"] == 5e6]
     low, high = min(row["mean"] for row in at), max(row["mean"] for row in at)
     return (
-        f"At 5 M frames published DQN stands at {low:,.0f} to {high:,.0f}, below the random player's "
+        f"At 5 M frames published DQN scores {low:,.0f} to {high:,.0f}, below the random player's "
         f"{RANDOM_SCORE:,.0f}: below random is normal here ({at[0]['source'].rpartition('/')[0]})."
     )
 

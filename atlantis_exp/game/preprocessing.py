@@ -63,7 +63,7 @@ class Preprocessing:
 
 
 class FrameStack:
-    """The newest `stack` observations of each environment, oldest first; an episode's first stands for any before it.
+    """The newest `stack` observations of each environment, oldest first; an episode's first fills the places before it.
 
     `state` is (num_envs, stack, size, size) uint8. A change makes a new array, so a state handed out stays as it was:
     `stack_frame` of report figure 2.3 shifts in place, and every next state is its state.

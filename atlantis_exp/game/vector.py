@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from atlantis_exp.faults import RunFault
 from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.preprocessing import Envs, Pixels
 
@@ -25,7 +26,7 @@ Calls = dict[int, tuple[Any, ...]]  # environment to the arguments of a call of 
 _FOR_THE_PARENT = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 
 
-class WorkerDied(RuntimeError):
+class WorkerDied(RunFault):
     """A worker process has ended; the message names it, its environments and the cause."""
 
 
@@ -214,9 +215,9 @@ def _play(emulators: dict[int, Emulator], rows: Rows, method: str, calls: Calls)
 
 
 def _cores_for(workers: int) -> list[int]:
-    """The cores that workers keep to: woken together, they else begin on the core of whoever wakes them.
+    """The core of each worker: woken together, they would otherwise begin on the core of whoever wakes them.
 
-    None where there are fewer workers than cores: runs side by side would keep to the same few.
+    An empty list, any core for all, where there are fewer workers than cores: parallel runs would share the same few.
     """
     if not hasattr(os, "sched_getaffinity"):  # no Linux
         return []

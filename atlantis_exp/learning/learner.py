@@ -1,23 +1,25 @@
 """The learner: two networks, an optimizer, and the update that moves them."""
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from atlantis_exp.learning.objectives import Objective, action_values, td_errors
 
 _MEASURES = ("loss", "q", "target", "gradient_norm")
 _AVERAGE_EVERY = 10  # updates, since an average of weights moves as much memory as the optimizer does
 
-T = TypeVar("T")
+_Shards = list[Sequence[Any]]
 
 
 class Learner:
@@ -38,8 +40,8 @@ class Learner:
     report leaves it in train mode (dropout and batch statistics in its targets) and moves its parameters alone:
     target_mode "train".
 
-    Whoever evaluates asks `evaluated`: the network, or with `ema` a mean of its weights over about as many updates, an
-    exponential moving average that learning and acting know nothing of.
+    `evaluated` is the network to evaluate: the online one or, with `ema`, an exponential moving average of its weights
+    over about as many updates, of which learning and acting know nothing.
 
     Statistics gather on the device: `update` never waits for it, and a GPU is sent batches from pinned memory.
 
@@ -99,14 +101,15 @@ class Learner:
         discount: npt.NDArray[np.floating],
         weights: npt.NDArray[np.floating] | None = None,
     ) -> torch.Tensor:
-        """Take one optimizer step on a batch of transitions, then move target and average if it is their turn.
+        """Take one optimizer step on a batch of transitions, then update target and average when due.
 
         States (B, C, H, W) in 0..255; actions, rewards and discounts (B,), as `Objective` wants them; weights (B,) of
-        the samples in the loss. Returns what each sample's value was off its target by, (B,), on the device.
+        the samples in the loss. Returns absolute TD errors (B,), on the device.
         """
         if weights is None:
             weights = np.ones(len(a_t), np.float32)
-        parts = self._in_shards(partial(self._gradients, len(a_t)), s_t, a_t, r_t, s_tpm, discount, weights)
+        shards = self._shards(s_t, a_t, r_t, s_tpm, discount, weights)
+        parts = self._each(shards)(partial(self._gradients, len(a_t)), *shards)
         gradients, means, errors = zip(*parts, strict=True)
         total, *others = gradients
         for other in others:
@@ -162,11 +165,15 @@ class Learner:
 
     def q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
         """Return the network's values (B, A) of states (B, C, H, W) in 0..255; changes nothing."""
-        return np.concatenate(self._in_shards(partial(self._values, self._online), states))
+        return self._all_values(self._online, states)
 
     def evaluated_q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
         """Return the values (B, A) of `evaluated` of states (B, C, H, W) in 0..255; changes nothing."""
-        return np.concatenate(self._in_shards(partial(self._values, self._evaluated), states))
+        return self._all_values(self._evaluated, states)
+
+    def _all_values(self, replicas: "_Replicas", states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+        shards = self._shards(states)
+        return np.concatenate([*self._each(shards)(partial(self._values, replicas), *shards)])
 
     @torch.inference_mode()
     def _values(self, replicas: "_Replicas", shard: int, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
@@ -174,13 +181,14 @@ class Learner:
         values: npt.NDArray[np.float32] = action_values(q).cpu().numpy()
         return values
 
-    def _in_shards(self, function: Callable[..., T], *batch: npt.NDArray[Any]) -> list[T]:
-        """Return what `function` makes of each shard's number and its part of a batch; none of the parts is empty."""
+    def _shards(self, *batch: npt.NDArray[Any]) -> "_Shards":
+        """Return the shards' numbers, then each array of a batch in as many parts, none of them empty."""
         count = min(self.shards, len(batch[0]))
-        if count == 1:
-            return [function(0, *batch)]
-        parts = zip(*(np.array_split(array, count) for array in batch), strict=True)
-        return list(self._threads.map(lambda shard, part: function(shard, *part), range(count), parts))
+        return [range(count), *(np.array_split(array, count) for array in batch)]
+
+    def _each(self, shards: "_Shards") -> Callable[..., Iterable[Any]]:
+        """Return what maps a function over shards: in a thread each, one alone in this one."""
+        return map if len(shards[0]) == 1 else self._threads.map
 
     @property
     def learning_rate(self) -> float:
@@ -192,6 +200,28 @@ class Learner:
     def learning_rate(self, value: float) -> None:
         for group in self.optimizer.param_groups:
             group["lr"] = value
+
+    @contextmanager
+    def restored(self) -> Iterator[None]:
+        """Let the block update the learner, which is then put back as it was."""
+        state = copy.deepcopy(self.state_dict())
+        yield
+        self.load_state_dict(state)
+
+    def update_flops(self, state: tuple[int, int, int], batch_size: int) -> int:
+        """Return the floating-point operations of one update on batches of states (C, H, W); changes nothing.
+
+        Two a multiply-add, in convolutions and matrix products alone: forward, backward and the objective's passes,
+        whatever they are.
+        """
+        passes = self._online_passes, self._target_passes
+        # The counter sees neither other threads nor compiled networks.
+        self._online_passes, self._target_passes = self._online.networks, self._target.networks
+        states, zeros = np.zeros((2, *state), np.uint8), np.zeros(2)
+        with self.restored(), FlopCounterMode(display=False) as counter:
+            self._gradients(2, 0, states, np.zeros(2, np.int64), zeros, states, zeros, zeros)
+        self._online_passes, self._target_passes = passes
+        return int(counter.get_total_flops() * batch_size // 2)
 
     def statistics(self) -> dict[str, float]:
         """Return the means over the updates since the last call and start anew; waits for the device.

@@ -5,6 +5,7 @@ from torch import nn
 
 from atlantis_exp.networks.heads import Head
 from atlantis_exp.networks.sizes import convolved
+from atlantis_exp.registry import SMALLEST_SIDE
 
 
 class DQNCnn(nn.Module):
@@ -15,7 +16,7 @@ class DQNCnn(nn.Module):
     `smallest_side`.
     """
 
-    smallest_side = 36  # pixels; 36 -> 8 -> 3 -> 1
+    smallest_side = SMALLEST_SIDE["cnn"]  # pixels
 
     def __init__(self, input_shape: tuple[int, int, int], num_actions: int, head: Head = nn.Linear) -> None:
         super().__init__()

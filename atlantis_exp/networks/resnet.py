@@ -6,6 +6,7 @@ from torch import nn
 from atlantis_exp.networks.dropout import Dropout
 from atlantis_exp.networks.heads import Head
 from atlantis_exp.networks.sizes import convolved
+from atlantis_exp.registry import SMALLEST_SIDE
 
 
 class ResNetBlock(nn.Module):
@@ -47,7 +48,7 @@ class ResNetDQN(nn.Module):
     `smallest_side`.
     """
 
-    smallest_side = 15  # pixels; 15 -> 7 -> 5 -> 3 -> 1
+    smallest_side = SMALLEST_SIDE["resnet"]  # pixels
 
     def __init__(self, input_shape: tuple[int, int, int], num_actions: int, head: Head = nn.Linear) -> None:
         super().__init__()

@@ -5,10 +5,11 @@ from torch import nn
 
 from atlantis_exp.networks.heads import Head
 from atlantis_exp.networks.sizes import convolved
+from atlantis_exp.registry import SMALLEST_SIDE
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions beside an identity, without normalisation (Espeholt et al. 2018, figure 3)."""
+    """Two 3x3 convolutions in parallel with an identity, without normalisation (Espeholt et al. 2018, figure 3)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -35,7 +36,7 @@ class ResNetFast(nn.Module):
     the first dense layer follows from `input_shape` = (C, H, W). Raises ValueError if a side is below `smallest_side`.
     """
 
-    smallest_side = 8  # pixels; 8 -> 1
+    smallest_side = SMALLEST_SIDE["resnet_fast"]  # pixels
 
     def __init__(self, input_shape: tuple[int, int, int], num_actions: int, head: Head = nn.Linear) -> None:
         super().__init__()

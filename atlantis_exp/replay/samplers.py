@@ -28,7 +28,7 @@ class Sampler(Protocol):
         """Take note of how far the values of transitions were off their targets, both (B,)."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that a continuation needs, beside the memory."""
+        """Return all that a continuation needs besides the memory."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue exactly where the sampler stood that `state_dict` described."""
@@ -109,13 +109,13 @@ class PrioritizedSampler:
 
     def feed_back(self, ids: npt.NDArray[np.int64], errors: npt.NDArray[np.float32]) -> None:
         """Give transitions that were drawn the priorities of their errors."""
-        # A loss that is no number ends the training, and must not end in an endless search before.
+        # A NaN priority would make `_find` loop forever.
         priorities = (np.nan_to_num(errors.astype(np.float64)) + _LEAST_ERROR) ** self.alpha
         self._set(ids % self._capacity, priorities)
         self._highest = max(self._highest, float(priorities.max()))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that a continuation needs, beside the memory: 8 bytes for each observation that this may hold."""
+        """Return all that a continuation needs besides the memory: 8 bytes for each observation that this may hold."""
         return {
             "priorities": self._leaves,
             "highest": self._highest,

@@ -1,4 +1,5 @@
-"""Metrics, images and weights enter; a run folder that tells its own story, and an MLflow run that mirrors it, leave.
+"""MLflow as a mirror of run folders, which can be thrown away and made again from them.
 
-Knows nothing of games, networks or configs: names and numbers only. MLflow is imported by `store` alone, on first use.
+In: run folders. Out: MLflow runs, here or on a server, and folders made again from these. It must not know games,
+networks or how anything is trained; MLflow itself is imported by `store` alone, on first use.
 """

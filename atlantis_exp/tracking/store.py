@@ -4,7 +4,6 @@ Sending is at least once and repeatable, hence visible exactly once: MLflow drop
 step, time and value), files overwrite themselves by name, runs and models are looked up before they are made.
 """
 
-import fcntl
 import gzip
 import json
 import logging
@@ -14,19 +13,20 @@ import shutil
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 from uuid import UUID, uuid5
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import AliasChoices, Field, TypeAdapter, ValidationError
 
-from atlantis_exp.tracking.journal import (
+from atlantis_exp.runs.folder import COMMIT, CONFIG, RESULT, TRACEBACK
+from atlantis_exp.runs.journal import (
     Artifact,
     Commit,
     Image,
@@ -39,6 +39,7 @@ from atlantis_exp.tracking.journal import (
     read_commit,
     write_file,
 )
+from atlantis_exp.runs.lock import alone
 from atlantis_exp.tracking.views import experiment_tags
 
 if TYPE_CHECKING:
@@ -51,16 +52,14 @@ _log = logging.getLogger(__name__)
 _POINTS = 500  # a call at least, where there are so many: fewer cost more each
 _PARAM_LENGTH = 6_000  # characters that MLflow keeps
 _RUN_NAME = "mlflow.runName"
-TRACEBACK = "traceback.txt"
-"""The file of a run folder that says at length why the run failed last."""
-_HOME = "published.json"
+_PRIMARY = "published.json"
 
 ORIGIN = "origin.json"
 """Where a folder that was brought from a server notes how far it is one with the run there."""
-BESIDE = ("config.json", "result.json", TRACEBACK)
-"""The small files that a run folder may hold beside its `commit.json`."""
-STANDING = "atlantis.standing"
-"""The tag of a run whose folder is on the server as of a commit: `standing` of its small files."""
+SMALL_FILES = (CONFIG, RESULT, TRACEBACK)
+"""The small files that a run folder may hold besides its `commit.json`."""
+FILES_TAG = "atlantis.standing"
+"""The tag of a run whose folder is on the server as of a commit: `files_digest` of its small files."""
 TRAVELS = "run_folder"
 """Where a run's artifacts hold its folder's small files and, in `journal/`, the committed bytes of its journal."""
 CHUNK = 2**23  # bytes of a journal that travel in one file
@@ -186,7 +185,7 @@ class Store:
         logging.getLogger("mlflow").setLevel(logging.CRITICAL)
         logging.getLogger("alembic").setLevel(logging.WARNING)
         self._root.mkdir(parents=True, exist_ok=True)
-        with _locked(self._root / "mlflow.lock"):  # processes that make the tables together break them for good
+        with alone(self._root / "mlflow.lock"):  # processes that make the tables together break them for good
             if self.is_local:
                 database_file = self._root / "mlflow.db"
                 if not database_file.exists():
@@ -230,11 +229,11 @@ class Files:
 
 def unfinished(folder: Path, root: Path) -> Store | None:
     """Returns the store, with its files under `root`, that lacks a part of what a published folder has committed."""
-    cursor, commit = Cursor.read(folder / _HOME), read_commit(folder)
+    cursor, commit = Cursor.read(folder / _PRIMARY), read_commit(folder)
     if cursor is None or commit is None:
         return None
     is_server = cursor.store.startswith("http")
-    if cursor.standing == standing(small_files(folder, commit, is_server)):
+    if cursor.files == files_digest(small_files(folder, commit, is_server)):
         return None
     uri, _, experiment = cursor.store.rpartition("#")
     return Store(root, experiment, uri if is_server else None)
@@ -271,7 +270,7 @@ class Publisher:
             for folder in self._folders:
                 try:
                     publish(folder, self._store)
-                except Exception as raised:  # one damaged folder is no reason to leave the others
+                except Exception as raised:  # one damaged folder is no reason to skip the others
                     error = error or raised
             if error is not None:
                 if not failing:
@@ -290,33 +289,34 @@ class Publisher:
                 self._draining.wait(delay)
 
 
-def publish(folder: Path, store: Store, home: bool = True) -> bool:
+def publish(folder: Path, store: Store, is_primary: bool = True) -> bool:
     """Brings the MLflow run of a folder up to the folder's last commit; returns whether it was behind.
 
     A run that has yet to start is left alone.
 
-    May be repeated, interrupted, and run by several processes at once without doubling anything. How far it came stands
-    in `published.json`; without that file everything is sent again. Lines are sent in their order, so a step never runs
-    backwards. Infinite values are left out (MLflow would show 1.8e308; the journal has them), NaN is kept. A file that
-    is gone is passed over with a warning. A param that changes once MLflow has it, as final there, becomes a tag.
+    May be repeated, interrupted, and run by several processes at once without doubling anything. How far it came is
+    noted in `published.json`; without that file everything is sent again. Lines are sent in their order, so a step
+    never runs backwards. Infinite values are left out (MLflow would show 1.8e308; the journal has them), NaN is kept. A
+    file that is gone is passed over with a warning. A param that changes once MLflow has it, as final there, becomes a
+    tag.
 
     Args:
-        home: whether this becomes the store that `unfinished` asks for; False leaves that to the one that is, if any,
-            and notes in a file of its own how far it came.
+        is_primary: whether this becomes the store that `unfinished` asks for; False leaves that to the one that is, if
+            any, and notes in a file of its own how far it came.
 
     Raises:
         ValueError: on a damaged journal.
         MlflowException, OSError, sqlite3.Error: when MLflow cannot be reached; what is missing stays to be published.
     """
     folder = folder.resolve()
-    note = _note(folder, store, home)
-    with _locked(note.with_suffix(".lock")):
+    note = _note(folder, store, is_primary)
+    with alone(note.with_suffix(".lock")):
         commit = read_commit(folder)
         if commit is None or commit.status == "SCHEDULED":
             return False
         files = small_files(folder, commit, is_server=not store.is_local)
         cursor = Cursor.of(note, folder, store, commit)
-        if cursor.standing == standing(files):
+        if cursor.files == files_digest(files):
             return False
         mirror = _Mirror(folder, store, cursor.run_id)
         if not store.is_local:
@@ -333,33 +333,33 @@ def publish(folder: Path, store: Store, home: bool = True) -> bool:
                 mirror.send(record)
             cursor = replace(cursor, offset=offset)
             cursor.save(note)
-        mirror.send_standing(commit, _parent_run(folder, store, commit, home))
+        mirror.send_state(commit, _parent_run(folder, store, commit, is_primary))
         if not store.is_local:
             mirror.send_small_files(files)
-        replace(cursor, standing=standing(files)).save(note)
+        replace(cursor, files=files_digest(files)).save(note)
         return True
 
 
-def _note(folder: Path, store: Store, home: bool) -> Path:
+def _note(folder: Path, store: Store, is_primary: bool) -> Path:
     """The file that says how far a folder is published in a store."""
     if (origin := brought(folder)) is not None and origin.store == store.address:
         return folder / ORIGIN
-    at_home = Cursor.read(folder / _HOME)
-    if home or at_home is None or at_home.store == store.address:
-        return folder / _HOME
+    primary = Cursor.read(folder / _PRIMARY)
+    if is_primary or primary is None or primary.store == store.address:
+        return folder / _PRIMARY
     return folder / f"published-{sha256(store.address.encode()).hexdigest()[:8]}.json"
 
 
 def small_files(folder: Path, commit: Commit, is_server: bool = True) -> dict[str, bytes]:
-    """Returns the files that say, beside its journal, what a run is and how it stands: their content by their names.
+    """Returns the content, by name, of the files that say what a run is and what state it is in.
 
-    A local store is beside the folder and needs none but the commit.
+    A local store can read the folder and needs none but the commit.
     """
-    names = [name for name in BESIDE if is_server and (folder / name).exists()]
-    return {"commit.json": commit_bytes(commit), **{name: (folder / name).read_bytes() for name in names}}
+    names = [name for name in SMALL_FILES if is_server and (folder / name).exists()]
+    return {COMMIT: commit_bytes(commit), **{name: (folder / name).read_bytes() for name in names}}
 
 
-def standing(files: Mapping[str, bytes]) -> str:
+def files_digest(files: Mapping[str, bytes]) -> str:
     """Returns a hash of small files, to be compared."""
     return sha256(json.dumps({name: sha256(files[name]).hexdigest() for name in sorted(files)}).encode()).hexdigest()
 
@@ -370,15 +370,15 @@ def brought(folder: Path) -> "Cursor | None":
     return origin if origin and commit and origin.identity == commit.identity else None
 
 
-def _parent_run(folder: Path, store: Store, commit: Commit, home: bool) -> str | None:
+def _parent_run(folder: Path, store: Store, commit: Commit, is_primary: bool) -> str | None:
     """The run that a folder's is shown under, which is published if it is not yet there."""
     if not commit.parent:
         return None
     parent = (folder / commit.parent).resolve()
     if not parent.exists():
         return None
-    publish(parent, store, home)
-    cursor = Cursor.read(_note(parent, store, home))
+    publish(parent, store, is_primary)
+    cursor = Cursor.read(_note(parent, store, is_primary))
     return cursor.run_id if cursor else None
 
 
@@ -390,7 +390,7 @@ class Cursor:
     identity: str
     run_id: str = ""
     offset: int = 0
-    standing: str = ""
+    files: Annotated[str, Field(validation_alias=AliasChoices("files", "standing"))] = ""  # `files_digest`, once sent
 
     @classmethod
     def of(cls, note: Path, folder: Path, store: Store, commit: Commit) -> "Cursor":
@@ -469,7 +469,7 @@ class _Mirror:
     def send_small_files(self, files: Mapping[str, bytes]) -> None:
         for name, content in files.items():
             self._send_file(f"{TRAVELS}/{name}", content)
-        self._send_tags({STANDING: standing(files)})  # last: who finds it finds all of them
+        self._send_tags({FILES_TAG: files_digest(files)})  # last: who finds it finds all of them
 
     def _send_file(self, path: str, content: bytes) -> None:
         with TemporaryDirectory() as aside:
@@ -477,7 +477,7 @@ class _Mirror:
             file.write_bytes(content)
             self._client.log_artifact(self._run_id, str(file), os.path.dirname(path))
 
-    def send_standing(self, commit: Commit, parent_run: str | None) -> None:
+    def send_state(self, commit: Commit, parent_run: str | None) -> None:
         if commit.status == "RUNNING":
             self._client.update_run(self._run_id, commit.status)
         else:
@@ -559,13 +559,3 @@ def image_name(run_id: str, record: Image) -> str:
     """Returns the path of an image among its run's artifacts, without its ending, as MLflow's pages look for it."""
     unique = uuid5(UUID(run_id), record.path)
     return f"images/{record.key.replace('/', '~')}+step+{record.step}+timestamp+{record.time}+{unique}"
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    with open(path, "w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        try:
-            yield
-        finally:
-            fcntl.flock(file, fcntl.LOCK_UN)  # closing alone would leave it with a process forked meanwhile

@@ -1,4 +1,4 @@
-"""The way back from a server: MLflow runs enter, the run folders that they were published from leave, byte for byte.
+"""The way back from a server: from MLflow runs to the run folders that they were published from, byte for byte.
 
 A folder's small files and the committed bytes of its journal travel as artifacts (see `store`), and each record of the
 journal names its own file. What a server says is data: places are checked, and small files count if their hash fits.
@@ -10,12 +10,15 @@ import logging
 import os
 import re
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
-from atlantis_exp.tracking.journal import (
+from atlantis_exp.runs.folder import COMMIT
+from atlantis_exp.runs.journal import (
     Artifact,
+    Commit,
     Image,
     Model,
     commit_of,
@@ -25,19 +28,19 @@ from atlantis_exp.tracking.journal import (
     write_file,
 )
 from atlantis_exp.tracking.store import (
-    BESIDE,
     CHUNK,
+    FILES_TAG,
     ORIGIN,
-    STANDING,
+    SMALL_FILES,
     TRAVELS,
     Cursor,
     Files,
     Store,
     StoredRun,
     brought,
+    files_digest,
     image_name,
     small_files,
-    standing,
 )
 
 _log = logging.getLogger(__name__)
@@ -59,9 +62,9 @@ def place(run: StoredRun, outputs: Path) -> Path:
 
 
 def is_here(folder: Path, run: StoredRun) -> bool:
-    """Whether a folder stands exactly as a run on a server does. Raises: JournalError."""
+    """Whether a folder is exactly as far as a run on a server is. Raises: JournalError."""
     commit = read_commit(folder)
-    return commit is not None and standing(small_files(folder, commit)) == run.tags.get(STANDING)
+    return commit is not None and files_digest(small_files(folder, commit)) == run.tags.get(FILES_TAG)
 
 
 def bring(run: StoredRun, folder: Path, store: Store, listed: Collection[str]) -> Outcome:
@@ -78,41 +81,64 @@ def bring(run: StoredRun, folder: Path, store: Store, listed: Collection[str]) -
         ValueError: on what cannot be a run folder's; the folder stays as it was.
         MlflowException, OSError: when the server cannot be reached.
     """
-    client = store.client
-    files = store.files(client.get_run(run.run_id).info.artifact_uri)
+    files = store.files(store.client.get_run(run.run_id).info.artifact_uri)
     names = files.names(TRAVELS)
-    small = {name: files.read(f"{TRAVELS}/{name}") for name in ("commit.json", *BESIDE) if name in names}
-    if standing(small) != run.tags.get(STANDING):
+    small = {name: files.read(f"{TRAVELS}/{name}") for name in (COMMIT, *SMALL_FILES) if name in names}
+    if files_digest(small) != run.tags.get(FILES_TAG):
         return "growing"
-    commit = commit_of(small["commit.json"])
+    commit = commit_of(small[COMMIT])
     _check_parent(folder, commit.parent)
-    start = 0
-    if (local := read_commit(folder)) is not None:
-        here, origin = standing(small_files(folder, local)), brought(folder)
-        untouched = origin is not None and (origin.store, origin.standing) == (store.address, here)
-        if local.identity == commit.identity:
-            is_newer = untouched or (commit.offset, commit.updated) > (local.offset, local.updated)
-            if commit.offset < local.offset or not is_newer:
-                return "ahead"
-            start = local.offset
-        elif untouched and origin is not None and origin.run_id not in listed:
-            (folder / "commit.json").unlink()  # readers first: the journal changes under them next
-        else:
-            return "other"
-    elif (folder / "journal.jsonl").exists() and not (folder / ORIGIN).exists():
-        return "other"  # it has lost its commit.json
-    Cursor(store.address, commit.identity, run.run_id, commit.offset, standing(small)).save(folder / ORIGIN)
+    local = _Local.of(folder, store)
+    decision, start = _decide(local, commit, listed)
+    if decision != "brought":
+        return decision
+    if local.commit is not None and local.commit.identity != commit.identity:
+        (folder / COMMIT).unlink()  # readers first: the journal changes under them next
+    Cursor(store.address, commit.identity, run.run_id, commit.offset, files_digest(small)).save(folder / ORIGIN)
     restore(folder, start, _journal(files, start, commit.offset))
     records = (record for _, record in read(folder, start, commit.offset))
     named = {record.path: record for record in records if isinstance(record, Artifact | Image | Model)}
     _bring_files(run, folder, store, files, named)
-    for name in BESIDE:
+    for name in SMALL_FILES:
         if name in small:
             write_file(folder / name, small[name])
         else:
             (folder / name).unlink(missing_ok=True)
-    write_file(folder / "commit.json", small["commit.json"])
+    write_file(folder / COMMIT, small[COMMIT])
     return "brought"
+
+
+@dataclass(frozen=True)
+class _Local:
+    """What is in a run's folder here before anything is brought."""
+
+    commit: Commit | None
+    has_journal: bool
+    was_brought: bool  # whether the folder notes a server as its origin, be it still one with the run there or not
+    untouched_from: str | None  # the server's run that the folder still equals
+
+    @classmethod
+    def of(cls, folder: Path, store: Store) -> Self:
+        commit, untouched_from = read_commit(folder), None
+        if commit is not None and (origin := brought(folder)) is not None:
+            digest = files_digest(small_files(folder, commit))
+            untouched_from = origin.run_id if (origin.store, origin.files) == (store.address, digest) else None
+        return cls(commit, (folder / "journal.jsonl").exists(), (folder / ORIGIN).exists(), untouched_from)
+
+
+def _decide(local: _Local, remote: Commit, listed: Collection[str]) -> tuple[Outcome, int]:
+    """What is to become of a run, and from which byte of its journal it is to be brought."""
+    if local.commit is None:
+        has_lost_its_commit = local.has_journal and not local.was_brought
+        return ("other" if has_lost_its_commit else "brought"), 0
+    if local.commit.identity == remote.identity:
+        ours, theirs = ((commit.offset, commit.updated) for commit in (local.commit, remote))
+        is_newer = local.untouched_from is not None or theirs > ours
+        if remote.offset < local.commit.offset or not is_newer:
+            return "ahead", 0
+        return "brought", local.commit.offset
+    was_replaced = local.untouched_from is not None and local.untouched_from not in listed
+    return ("brought" if was_replaced else "other"), 0
 
 
 def _check_parent(folder: Path, parent: str) -> None:

@@ -8,7 +8,7 @@ import json
 import zlib
 from typing import Any
 
-from atlantis_exp.tracking.journal import NOTE
+from atlantis_exp.runs.journal import NOTE
 
 _SECTIONS = {  # cards a row, and their height in pixels
     "score": (2, 360),

@@ -1,4 +1,5 @@
-"""The training: built emulators, actor, memory and learner enter; a journal, checkpoints and an outcome leave.
+"""The training loop, and what evaluates, records and continues it.
 
-The only wing that has seen game, replay and learning together. Knows no config, no Hydra and no MLflow.
+In: built emulators, actor, memory and learner. Out: a journal, checkpoints, an outcome. The only wing that has seen
+game, replay and learning together. It must not know config, Hydra or MLflow.
 """

@@ -13,14 +13,15 @@ import safetensors.torch
 import torch
 from safetensors import SafetensorError
 
+from atlantis_exp.faults import RunFault
 from atlantis_exp.replay.memory import ReplayMemory
-from atlantis_exp.tracking.journal import write_file
+from atlantis_exp.runs.journal import write_file
 
 FORMAT = 1
 _SEGMENTS = 64  # of a full memory, about
 
 
-class CheckpointError(RuntimeError):
+class CheckpointError(RunFault):
     """No checkpoint that could be continued from, although there is one; says which and why."""
 
 
@@ -28,7 +29,7 @@ class Checkpoints:
     """Generations of a training's state under a folder; the two newest are kept.
 
     A generation is a folder with `state.json` (the tree, with a place for each array), `tensors.safetensors` and
-    `arrays.safetensors`. The replay memory lies beside them in segments that never change and are shared: a save adds
+    `arrays.safetensors`. The replay memory is kept apart, in segments that never change and are shared: a save adds
     only what came since the last one, and a small last segment once more. A generation counts from the moment its
     `manifest.json`, which holds the checksum of every file and its own, is in place. `identity` is the experiment that
     the state belongs to.
@@ -46,7 +47,7 @@ class Checkpoints:
         since = segments[-1]["next_id"] if segments else memory.oldest_id
         if memory.next_id > since:
             if segments and since - segments[-1]["since"] < memory.capacity // _SEGMENTS:
-                since = segments.pop()["since"]  # written again with what is new, or frequent saves would leave crumbs
+                since = segments.pop()["since"]  # again, with what is new: frequent saves would make tiny segments
             name = f"segments/{since:012d}-{memory.next_id:012d}"
             checksums = self._write(name, memory.segment(since))
             segments.append({"name": name, "since": since, "next_id": memory.next_id, "sha256": checksums})

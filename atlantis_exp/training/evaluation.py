@@ -1,22 +1,18 @@
 """Evaluation: episodes at a fixed epsilon, on their own emulators and random streams (report figure 3.3)."""
 
-import csv
-import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from atlantis_exp.game.emulator import ACTIONS, Emulator
+from atlantis_exp.game.emulator import ACTIONS
 from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.game.vector import Emulators
+from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.statistics import Summary, summarize
-from atlantis_exp.training.actor import Actor, States
-
-QValues = Callable[[States], npt.NDArray[np.float32]]
+from atlantis_exp.training.actor import Actor
 
 GUNS = {"centre": (100.0, 1_000.0), "side": (200.0, 2_000.0)}
 """What a step pays when a gun hits one vessel or one bomber; other sums are of several hits or of a wave's end."""
@@ -101,7 +97,7 @@ class Evaluation:
 
     @property
     def collapsed(self) -> bool:
-        """Whether the network has settled on one action, which scores 2,000 when held: a press fires once."""
+        """Whether the network chooses one action only, which scores 2,000 when held: a press fires once."""
         return self.favourite[1] > _COLLAPSED
 
     @property
@@ -144,19 +140,19 @@ class Evaluation:
             },
         }
 
-    def table(self) -> str:
-        """A CSV line an episode, with its steps by action, and those of them that chance chose."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        by_chance = [f"{action}_random" for action in ACTIONS]
-        writer.writerow(("episode", "seed", "score", "steps", "frames", "truncated", "random", *ACTIONS, *by_chance))
-        for index, episode in enumerate(self.episodes):
-            counts = episode.action_counts
-            ends = (episode.steps, episode.frames, int(episode.truncated), sum(episode.random))
-            writer.writerow(
-                (index, episode.seed, episode.score, *ends, *counts.sum(1).tolist(), *counts[:, 1].tolist())
-            )
-        return text.getvalue()
+    def table(self) -> EpisodeTable:
+        """The episodes as they are kept."""
+        columns = ("seed", "score", "steps", "frames", "truncated")
+        values = {name: np.array([getattr(episode, name) for episode in self.episodes]) for name in columns}
+        return EpisodeTable(
+            actions=ACTIONS,
+            seeds=values["seed"],
+            scores=values["score"].astype(np.float64),
+            steps=values["steps"].astype(np.float64),
+            frames=values["frames"].astype(np.float64),
+            truncated=values["truncated"].astype(np.float64),
+            counts=np.array([episode.action_counts for episode in self.episodes], np.float64),
+        )
 
     def report(self) -> str:
         """The evaluation as the report prints it (figures 5.4, 5.5 and 5.9)."""
@@ -184,8 +180,8 @@ def evaluate(
 ) -> Evaluation:
     """Play `episodes` episodes side by side; what each is like depends on `seed` and its own index alone.
 
-    size in pixels and stack in observations, as the actor's states want them. on_step is told of all episodes, and how
-    many of them are over, after every step of those that are played.
+    size in pixels and stack in observations, as the actor's states want them. on_step is called with all episodes, and
+    how many of them are over, after every step of those that are played.
 
     Raises:
         Stopped: when `stop`, which is asked before every step, says so.
@@ -231,31 +227,6 @@ def evaluate(
                 begin(env)
         on_step(played, over)
     return Evaluation(epsilon, played)
-
-
-class Moment(NamedTuple):
-    """What was on screen before a step of an episode, and what was decided on it; at the end nothing was."""
-
-    screen: npt.NDArray[np.uint8]  # (210, 160, 3)
-    score: float  # so far
-    action: int | None
-    random: bool
-    q_values: npt.NDArray[np.float32] | None  # (actions,), what the network thought of them even where chance chose
-
-
-def replay(episode: Episode, emulator: Emulator, stack: int, q_values: QValues | None = None) -> Iterator[Moment]:
-    """Play an episode again from its seed and actions; stack in observations, as the network wants its states."""
-    observation = emulator.reset(episode.seed)
-    stacks = FrameStack(1, observation.shape[0], stack)
-    stacks.reset([0], observation[np.newaxis])
-    score = 0.0
-    for action, random in zip(episode.actions, episode.random, strict=True):
-        values = None if q_values is None else q_values(stacks.state)[0]
-        yield Moment(emulator.screen_rgb(), score, action, bool(random), values)
-        step = emulator.step(action)
-        stacks.push(step.observation[np.newaxis])
-        score += step.reward
-    yield Moment(emulator.screen_rgb(), score, None, False, None)
 
 
 def _seed_sequence(seed: int, index: int) -> np.random.SeedSequence:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from atlantis_exp.replay.memory import ReplayMemory
-from atlantis_exp.tracking.journal import Image, Metrics, Model, read
+from atlantis_exp.runs.journal import Image, Metrics, Model, read
 
 WALL_CLOCK = ("throughput/steps_per_second", "throughput/hours")
 """Metrics that measure the machine, not the training."""

@@ -1,5 +1,6 @@
 """The budget planner: what a training will cost on this machine, from a few seconds of measurement on it."""
 
+import copy
 import shutil
 import statistics
 import time
@@ -10,10 +11,8 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from atlantis_exp.game.vector import Emulators
-from atlantis_exp.learning.learner import Learner
 from atlantis_exp.replay.memory import ReplayMemory
-from atlantis_exp.training.trainer import Plan
+from atlantis_exp.training.trainer import Trainer
 
 _EPISODE_STEPS = 2_000  # of a random player in `Atlantis-v0`; a good one plays many times longer
 _WARM_MEMORY = 512 * 2**20  # bytes that torch and its thread buffers grow by once they work
@@ -59,28 +58,27 @@ class Forecast:
 
 
 def forecast(
-    plan: Plan,
-    learner: Learner,
-    emulators: Emulators,
+    trainer: Trainer,
     *,
     capacity: int,
     max_bytes: int,
     size: int,
     stack: int,
-    outputs: Path,
     steps_done: int,
-    max_steps: int | None,
     evaluations_an_episode: float,
 ) -> Forecast:
-    """Measure emulation, acting and learning on parts made for it, which are of no use afterwards.
+    """Time emulation, acting and learning with a trainer's parts, which are as before afterwards.
 
-    capacity in observations, max_bytes of the replay memory, size in pixels; the trainer's own parts stay untouched.
+    Its emulators have yet to begin, or to be brought back to, an episode. capacity in observations, max_bytes of the
+    replay memory, size in pixels; the memory that is measured is a throwaway one.
     """
+    plan, learner, emulators = trainer.plan, trainer.learner, trainer.emulators
     num_envs = emulators.num_envs
     rng = np.random.default_rng(0)
     memory = ReplayMemory(4_096, (size, size), stack=stack, budget_bytes=4_096 * size * size)
     for env, observation in enumerate(emulators.reset(range(num_envs), [0] * num_envs)):
         memory.begin(env, observation)
+    sampler = copy.deepcopy(plan.phases[0].sampler)
 
     def play() -> None:
         actions = rng.integers(4, size=num_envs)
@@ -88,22 +86,22 @@ def forecast(
         for env in range(num_envs):
             memory.add(env, int(actions[env]), float(steps.rewards[env]), steps.observations[env], False)
 
-    play_seconds = _median_seconds(play, at_least=8, seconds=1.0)
-    states = np.zeros((num_envs, stack, size, size), np.uint8)
-    act_seconds = _median_seconds(lambda: learner.q_values(states), at_least=3, seconds=0.5)
-    sampler = plan.phases[0].sampler
-
     def update() -> None:
         ids, weights = sampler.sample(memory, plan.batch_size, rng)
         learner.update(*memory.gather(ids, plan.returns), weights).cpu()  # waits for a GPU
 
-    update_seconds = _median_seconds(update, at_least=3, seconds=1.0)
+    with learner.restored():
+        play_seconds = _median_seconds(play, at_least=8, seconds=1.0)
+        states = np.zeros((num_envs, stack, size, size), np.uint8)
+        act_seconds = _median_seconds(lambda: learner.q_values(states), at_least=3, seconds=0.5)
+        update_seconds = _median_seconds(update, at_least=3, seconds=1.0)
+    emulators.reset(range(num_envs), [0] * num_envs)  # a console that has not played
 
     length = plan.length * (1 if plan.unit == "steps" else _EPISODE_STEPS)
     epsilon = statistics.fmean(plan.epsilon(progress, int(progress * length)) for progress in np.linspace(0, 1, 101))
     acts = 1 - epsilon**num_envs  # share of the iterations in which any environment asks the network
     seconds_a_step = (play_seconds + acts * act_seconds) / num_envs + update_seconds / plan.learn_every
-    steps = max(1, (length if max_steps is None else min(length, max_steps)) - steps_done)
+    steps = max(1, (length if trainer.max_steps is None else min(length, trainer.max_steps)) - steps_done)
     stored = min(capacity, steps_done + steps)
     replay_bytes = min(max_bytes, stored * memory.nbytes // memory.next_id)
     weights = sum(tensor.nbytes for tensor in learner.network.state_dict().values())
@@ -115,7 +113,7 @@ def forecast(
         memory_available=psutil.virtual_memory().available,
         # Two generations of all networks and two moments; weights of each evaluation, in the folder and in MLflow.
         disk=int(replay_bytes + (10 if learner.ema else 8) * weights + 2 * evaluations * weights),
-        disk_available=shutil.disk_usage(_existing(outputs)).free,
+        disk_available=shutil.disk_usage(_existing(trainer.checkpoints.folder)).free,
     )
 
 

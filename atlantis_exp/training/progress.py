@@ -2,7 +2,10 @@
 
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,10 +18,63 @@ from atlantis_exp.statistics import EARLY_FRAMES, RANDOM_SCORE
 
 if TYPE_CHECKING:
     from atlantis_exp.training.evaluation import Episode, Evaluation
-    from atlantis_exp.training.trainer import Trainer
 
 _PLAIN_SECONDS = 10.0  # between two plain lines
-_WINDOW_SECONDS = 30.0  # that the speed is measured over
+_DRAW_SECONDS = 0.25  # between two states of the bar
+_WINDOW_SECONDS = 30.0  # that the pace is measured over
+_MARK_SECONDS = 0.25  # between two marks in that window
+
+
+class Pace:
+    """Steps a second over the last half minute, pauses not counted."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._marks: deque[tuple[float, int]] = deque()  # time, steps
+        self._latest = (0.0, 0)
+
+    def tick(self, steps: int) -> None:
+        """To be called after every step, and once before the first."""
+        self._latest = now, _ = self._clock(), steps
+        if not self._marks or now - self._marks[-1][0] >= _MARK_SECONDS:
+            self._marks.append(self._latest)
+        while now - self._marks[0][0] > _WINDOW_SECONDS and len(self._marks) > 2:
+            self._marks.popleft()
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Leave the time of the block out."""
+        start = self._clock()
+        try:
+            yield
+        finally:
+            pause = self._clock() - start
+            self._marks = deque((then + pause, steps) for then, steps in self._marks)
+            self._latest = (self._latest[0] + pause, self._latest[1])
+
+    @property
+    def steps_per_second(self) -> float:
+        """As of the latest tick; 0 before there are two."""
+        if not self._marks or (seconds := self._latest[0] - self._marks[0][0]) <= 0:
+            return 0.0
+        return (self._latest[1] - self._marks[0][1]) / seconds
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """How far a training is."""
+
+    episode: int  # under way, counted from 1
+    scores: Sequence[float]  # of the last 20 episodes
+    lengths: Sequence[int]  # of the last 100 episodes, steps
+    epsilon: float
+    steps: int
+    updates: int
+    steps_per_second: float
+    phase: str
+    done: int  # of the plan, in its unit
+    length: int  # of the plan, in its unit
+    steps_left: float | None  # None where nothing tells
 
 
 class Progress:
@@ -26,61 +82,61 @@ class Progress:
 
     def __init__(self, console: Console | None = None) -> None:
         self.console = console or Console(highlight=False, soft_wrap=True)
-        self.steps_per_second = 0.0
-        self._marks: deque[tuple[float, int]] = deque()  # time, steps
-        self._shown = 0.0  # time
+        self._shown: float | None = None  # time
         self._live: Live | None = None
 
     def say(self, text: str) -> None:
         """A line of its own."""
         self.console.print(text, markup=False)
 
-    def update(self, trainer: "Trainer") -> None:
-        """To be called after every step: draws a few times a second, or writes a line now and then."""
-        now = time.monotonic()
-        if now - self._shown < (0.25 if self.console.is_terminal else _PLAIN_SECONDS):
-            return
-        first = self._shown == 0.0
-        self._shown = now
-        self._marks.append((now, trainer.counters.steps))
-        while now - self._marks[0][0] > _WINDOW_SECONDS and len(self._marks) > 2:
-            self._marks.popleft()
-        then, steps = self._marks[0]
-        elapsed = now - then
-        self.steps_per_second = (trainer.counters.steps - steps) / elapsed if elapsed > 0 else 0.0
+    def is_due(self) -> bool:
+        """Whether it is time for `show`: a few times a second on a terminal, now and then elsewhere."""
         if self.console.is_terminal:
-            self._draw(trainer)
-        elif not first:
-            self.say(self._line(trainer))
+            return self._shown is None or time.monotonic() - self._shown >= _DRAW_SECONDS
+        return self._is_time_for_a_line()
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Draw a training's bar, or write its line."""
+        self._shown = time.monotonic()
+        if not self.console.is_terminal:
+            self.say(_line(snapshot))
+            return
+        table = Table.grid(padding=(0, 1))
+        table.add_row(ProgressBar(total=snapshot.length, completed=snapshot.done, width=24), _line(snapshot))
+        if self._live is None:
+            self._live = Live(table, console=self.console, transient=True, auto_refresh=False)
+            self._live.start()
+        self._live.update(table, refresh=True)
 
     def evaluating(self, episodes: Sequence["Episode"], over: int) -> None:
         """To be called after every step of an evaluation: writes a line now and then. Good games last for minutes."""
-        now = time.monotonic()
-        if self._shown == 0.0:
-            self._shown = now
-        if now - self._shown >= _PLAIN_SECONDS:
-            self._shown = now
+        if self._is_time_for_a_line():
+            self._shown = time.monotonic()
             steps, high = sum(episode.steps for episode in episodes), max(episode.score for episode in episodes)
             self.say(
                 f"  evaluation: {over} of {len(episodes)} episodes over, {steps:,} steps, highest score {high:,.0f}"
             )
 
-    def evaluated(self, trainer: "Trainer", evaluation: "Evaluation") -> None:
-        """To be called after every evaluation."""
-        self._marks.clear()  # the time it took is not the training's
+    def evaluated(self, step: int, frames: int, evaluation: "Evaluation") -> None:
+        """To be called after every evaluation of a training, with the steps and frames that it has trained for."""
         summary = evaluation.summary
         self.say(
-            f"step {trainer.counters.steps:,}, {summary.episodes} episodes evaluated at epsilon {evaluation.epsilon}: "
+            f"step {step:,}, {summary.episodes} episodes evaluated at epsilon {evaluation.epsilon}: "
             f"mean {summary.mean:,.0f} +- {summary.standard_error:,.0f}, high {summary.high:,.0f}, "
             f"low {summary.low:,.0f}, interquartile mean {summary.interquartile_mean:,.0f}"
         )
         if evaluation.collapsed:
             self.say(f"warning: the policy has {evaluation.policy}; any one action, held, scores 2,000")
-        if summary.mean < RANDOM_SCORE and trainer.counters.frames <= EARLY_FRAMES:
+        if summary.mean < RANDOM_SCORE and frames <= EARLY_FRAMES:
             self.say(
                 f"  below the published random player's {RANDOM_SCORE:,.0f}, which is normal here: "
                 f"at 5 M frames published DQN is at 7,000 to 9,000 (docs/comparison.md)"
             )
+
+    def _is_time_for_a_line(self) -> bool:
+        if self._shown is None:  # the first one comes when there is something to tell
+            self._shown = time.monotonic()
+        return time.monotonic() - self._shown >= _PLAIN_SECONDS
 
     def close(self) -> None:
         """End the bar."""
@@ -88,38 +144,22 @@ class Progress:
             self._live.stop()
             self._live = None
 
-    def _line(self, trainer: "Trainer") -> str:
-        counters = trainer.counters
-        scores = trainer.recent_scores(20)
-        shown = "first episode"
-        if scores:
-            lengths = [played.length for played in trainer.episodes[-100:]]
-            shown = (
-                f"score {scores[-1]:,.0f}  mean of 20 {np.mean(scores):,.0f}  "
-                f"duration {lengths[-1]:,} (mean of 100 {np.mean(lengths):,.0f})"
-            )
-        done, length = trainer.done, trainer.plan.length
-        left = self._time_left(trainer)
-        return (
-            f"episode {counters.episodes + 1:,}  {shown}  epsilon {trainer.epsilon:.2f}  "
-            f"step {counters.steps:,}  updates {trainer.learner.updates:,}  {self.steps_per_second:,.0f} steps/s  "
-            f"phase {trainer.phase.name}  {done / length:.1%}  left {left}"
+
+def _line(snapshot: Snapshot) -> str:
+    shown = "first episode"
+    if snapshot.scores:
+        shown = (
+            f"score {snapshot.scores[-1]:,.0f}  mean of 20 {np.mean(snapshot.scores):,.0f}  "
+            f"duration {snapshot.lengths[-1]:,} (mean of 100 {np.mean(snapshot.lengths):,.0f})"
         )
+    return (
+        f"episode {snapshot.episode:,}  {shown}  epsilon {snapshot.epsilon:.2f}  "
+        f"step {snapshot.steps:,}  updates {snapshot.updates:,}  {snapshot.steps_per_second:,.0f} steps/s  "
+        f"phase {snapshot.phase}  {snapshot.done / snapshot.length:.1%}  left {_time_left(snapshot)}"
+    )
 
-    def _time_left(self, trainer: "Trainer") -> str:
-        share = trainer.done / trainer.plan.length
-        if share <= 0 or self.steps_per_second <= 0:
-            return "?"
-        steps = trainer.counters.steps * (1 - share) / share
-        if trainer.max_steps is not None:
-            steps = min(steps, trainer.max_steps - trainer.counters.steps)
-        minutes, seconds = divmod(int(max(steps, 0) / self.steps_per_second), 60)
-        return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
 
-    def _draw(self, trainer: "Trainer") -> None:
-        table = Table.grid(padding=(0, 1))
-        table.add_row(ProgressBar(total=trainer.plan.length, completed=trainer.done, width=24), self._line(trainer))
-        if self._live is None:
-            self._live = Live(table, console=self.console, transient=True, auto_refresh=False)
-            self._live.start()
-        self._live.update(table, refresh=True)
+def _time_left(snapshot: Snapshot) -> str:
+    if snapshot.steps_left is None or snapshot.steps_per_second <= 0:
+        return "?"
+    return str(timedelta(seconds=int(max(snapshot.steps_left, 0) / snapshot.steps_per_second)))

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from atlantis_exp.build import count_update_flops
 from benchmarks import emulation, learner, overhead, replay, store, training
 from benchmarks.contest import paired_ratio, ratio, take_turns
 
@@ -102,7 +101,7 @@ def test_a_mistaken_override_of_a_learner_is_told(capsys: pytest.CaptureFixture[
 def test_the_flops_of_an_update_are_those_of_its_layers() -> None:
     # multiply-adds of the forward pass by layer; the first convolution has no gradient with regard to its input
     first, others = 20 * 20 * 32 * 4 * 64, 9 * 9 * 64 * 32 * 16 + 7 * 7 * 64 * 64 * 9 + 3136 * 512 + 512 * 4
-    assert count_update_flops(learner.Case("cnn", 2, "fp32").config()) == 2 * 2 * (3 * first + 4 * others)
+    assert learner.flops_of(learner.Case("cnn", 2, "fp32").config()) == 2 * 2 * (3 * first + 4 * others)
 
 
 @pytest.mark.slow

@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from atlantis_exp.comparison.gather import gather, group, refuse_mixed_protocols, select
-from atlantis_exp.config import Config, ConfigError
-from atlantis_exp.tracking.journal import Journal
+from atlantis_exp.config import Config
+from atlantis_exp.faults import ConfigError
+from atlantis_exp.runs.journal import Journal
 from atlantis_exp.training.evaluation import Episode, Evaluation
 
 Recorded = Callable[..., Path]
@@ -23,10 +24,8 @@ def evaluated(outputs: Path, run: Path, score: float, epsilon: float, step: int 
     facts = {"run": run.name, "step": step, "evaluation": {"epsilon": epsilon}}
     (folder / "config.json").write_text(json.dumps(facts))
     episode = Episode(0, score, 9, False, bytearray([1, 1, 1]), bytearray([0, 0, 1]))
-    journal.artifact("evaluation/episodes.csv", Evaluation(epsilon, [episode]).table().encode())
-    journal.state_dict()
-    journal.commit()
-    journal.status("FINISHED")
+    journal.artifact("evaluation/episodes.csv", Evaluation(epsilon, [episode]).table().to_csv().encode())
+    journal.finish()
     (folder / "result.json").write_text("{}")
     return folder
 
@@ -75,7 +74,7 @@ def test_broken_unfinished_foreign_and_put_aside_runs_are_named_and_do_not_count
         "foreign: it has no config.json": lambda run: (run / "config.json").unlink(),
         "no evaluation after its last step: evaluate run=": lambda run: shutil.rmtree(run / "artifacts"),
         "broken: .*has no episode": lambda run: next(run.rglob("*.csv")).write_text("score,steps\n"),
-        "broken: list indices": lambda run: (run / "result.json").write_text("[1]"),
+        "broken: .*result.json is damaged": lambda run: (run / "result.json").write_text("[1]"),
         "does not say who chose": lambda run: next(run.rglob("*.csv")).write_text("score,steps,truncated\n1,1,0\n"),
     }
     for index, strike in enumerate(damage.values()):

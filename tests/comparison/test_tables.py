@@ -11,7 +11,7 @@ import scipy.stats
 
 from atlantis_exp.comparison import tables
 from atlantis_exp.comparison.gather import gather, group
-from atlantis_exp.comparison.tables import Comparison, compare, early_dqn, published, to_csv
+from atlantis_exp.comparison.tables import Comparison, compare, early_dqn, literature, to_csv
 
 Recorded = Callable[..., Path]
 GOOD = (
@@ -207,7 +207,7 @@ def test_the_time_cap_is_named_where_it_decides(compared: Callable[..., Comparis
 
 def test_early_scores_below_random_come_with_the_reason(compared: Callable[..., Comparison]) -> None:
     assert early_dqn() in compared().notes
-    assert "At 5 M frames published DQN stands at 7,433 to 8,341, below the random player's 12,850" in early_dqn()
+    assert "At 5 M frames published DQN scores 7,433 to 8,341, below the random player's 12,850" in early_dqn()
 
 
 def test_a_late_curve_has_the_published_ones_beside_it_and_no_excuse(compared: Callable[..., Comparison]) -> None:
@@ -217,11 +217,11 @@ def test_a_late_curve_has_the_published_ones_beside_it_and_no_excuse(compared: C
 
 
 def test_what_is_published_has_a_protocol_and_a_source() -> None:
-    scores = {row["name"]: row for row in published("scores")}
+    scores = {row["name"]: row for row in literature("scores")}
     assert all(row["protocol"] and row["source"] and row["kind"] in ("player", "algorithm") for row in scores.values())
     assert scores["random player"]["score"] == 12_850
     assert scores["GDI-H3"]["score"] == 3_837_300
-    assert all(row["source"] and row["seeds"] == 5 for row in published("curves"))
+    assert all(row["source"] and row["seeds"] == 5 for row in literature("curves"))
 
 
 def test_a_table_survives_csv(compared: Callable[..., Comparison]) -> None:

@@ -16,12 +16,14 @@ from pathlib import Path
 
 import pytest
 
-from atlantis_exp.commands.app import check
-from atlantis_exp.commands.runs import RunFolder
-from atlantis_exp.commands.slurm import all_awaited
-from atlantis_exp.commands.train import train
-from atlantis_exp.commands.verify_resume import fingerprints
-from atlantis_exp.config import Config, ConfigError
+from atlantis_exp.commands.overrides import check
+from atlantis_exp.config import Config
+from atlantis_exp.faults import ConfigError
+from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.launchers.slurm import all_awaited
+from atlantis_exp.sessions.training import train
+from atlantis_exp.sessions.verifying import fingerprints
 
 Compose = Callable[..., Config]
 REPOSITORY = Path(__file__).parents[2]
@@ -141,7 +143,7 @@ def test_jobs_that_are_preempted_requeued_timed_out_or_cancelled_end_as_the_unbr
         assert sweep.poll() is None
         for seed in list(running):
             if list(folders[seed].path.glob("checkpoints/0*/manifest.json")):
-                process = (folders[seed].path / "lock").read_text().split()[1]
+                process = (folders[seed].path / "holder.txt").read_text().split()[1]
                 os.kill(int(process), signal.SIGSTOP)  # Slurm sends a SIGCONT with each signal of its own
                 running.remove(seed)
         return not running
@@ -179,7 +181,7 @@ def test_jobs_that_are_preempted_requeued_timed_out_or_cancelled_end_as_the_unbr
     assert again.stdout.splitlines()[-1] == "sweep of 4 runs: 4 done"
     for config in configs:
         unbroken = tiny(*chosen, f"seed={config.seed}", "tracking=none", f"paths.outputs={tmp_path}/unbroken")
-        train(unbroken)
+        train(Job(unbroken))
         assert fingerprints(config, tmp_path) == fingerprints(unbroken, tmp_path / "unbroken")
 
     told = [line.split() for line in (tmp_path / "told").read_text().splitlines()]

@@ -16,7 +16,7 @@ from typing import Any
 import psutil
 import pytest
 
-from atlantis_exp.tracking.journal import Metrics, read
+from atlantis_exp.runs.journal import Metrics, read
 
 REPOSITORY = Path(__file__).parents[2]
 PROGRAMS = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
@@ -24,7 +24,7 @@ WRITER = """
 import io, sys, time
 from pathlib import Path
 from PIL import Image
-from atlantis_exp.tracking.journal import Journal
+from atlantis_exp.runs.journal import Journal
 from atlantis_exp.tracking.store import Publisher, Store
 outputs, name, address = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
 journal = Journal(outputs / "runs" / name, {"mlflow.runName": name})

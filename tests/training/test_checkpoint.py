@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from atlantis_exp.config import Config
 from atlantis_exp.replay.memory import ReplayMemory
-from atlantis_exp.tracking.journal import read_commit
+from atlantis_exp.runs.journal import read_commit
 from atlantis_exp.training.checkpoint import FORMAT, CheckpointError, Checkpoints, _checksum
 from atlantis_exp.training.fingerprint import fingerprint
 from atlantis_exp.training.trainer import Trainer
@@ -195,47 +194,58 @@ def test_a_save_that_the_disk_refuses_leaves_the_last_one(tmp_path: Path, monkey
 def die_in_commit(trainer: Trainer, folder: Path, operation: int) -> bool:
     """Commit to a folder in a forked process that dies before its n-th file operation; False if it had no n-th."""
     if (child := os.fork()) == 0:
-        trainer.checkpoints.folder = folder / "checkpoints"
-        trainer.tracker._folder = folder  # type: ignore[attr-defined]
-        count = 0
+        try:
+            _commit_and_die(trainer, folder, operation)
+        finally:
+            os._exit(1)
+    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    assert status in (0, 9)
+    return status == 9
 
-        def tick(event: str, _: object = None) -> None:
-            nonlocal count
-            if event in ("open", "fsync", "os.rename", "os.mkdir", "os.remove", "os.rmdir"):
-                count += 1
-                if count > operation:
-                    os._exit(9)
 
-        synced = os.fsync
+def _commit_and_die(trainer: Trainer, folder: Path, operation: int) -> None:
+    trainer.checkpoints.folder = folder / "checkpoints"
+    trainer.recorder.tracker._folder = folder  # type: ignore[attr-defined]
+    count = 0
 
-        def sync(file: int) -> None:
-            tick("fsync")
-            synced(file)
+    def tick(event: str, _: object = None) -> None:
+        nonlocal count
+        if event in ("open", "fsync", "os.rename", "os.mkdir", "os.remove", "os.rmdir"):
+            count += 1
+            if count > operation:
+                os._exit(9)
 
-        os.fsync = sync  # type: ignore[assignment]
-        sys.addaudithook(tick)
-        trainer.commit()
-        os._exit(0)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+    synced = os.fsync
+
+    def sync(file: int) -> None:
+        tick("fsync")
+        synced(file)
+
+    os.fsync = sync  # type: ignore[assignment]
+    sys.addaudithook(tick)
+    trainer.commit()
+    os._exit(0)
 
 
 @pytest.mark.parametrize(
     "continued", [pytest.param(False, id="loaded"), pytest.param(True, id="continued", marks=pytest.mark.slow)]
 )
 def test_a_death_at_any_file_operation_of_a_commit_leaves_the_commit_before_or_this_one(
-    tiny: Callable[..., Config], started: Callable[[Config, Path], Trainer], tmp_path: Path, continued: bool
+    small: Callable[..., Trainer], tmp_path: Path, continued: bool
 ) -> None:
+    def begun(folder: Path) -> Trainer:
+        return small(folder, evaluate_steps=None)
+
     def sessions(trainer: Trainer, *steps: int) -> None:
         for goal in steps:
             assert trainer.run(lambda goal=goal: trainer.counters.steps == goal) == "interrupted"  # type: ignore[misc]
 
-    config = tiny("evaluation.every_steps=null")
-    dying = started(config, tmp_path / "base")
+    dying = begun(tmp_path / "base")
     sessions(dying, 60, 100)
     dying.commit = lambda: None  # type: ignore[method-assign]
     sessions(dying, 160)
     del dying.commit  # the class has it
-    unbroken = started(config, tmp_path / "unbroken")
+    unbroken = begun(tmp_path / "unbroken")
     unbroken.run()
     goal = fingerprint(unbroken.state_dict(), unbroken.memory, tmp_path / "unbroken")
 
@@ -245,14 +255,15 @@ def test_a_death_at_any_file_operation_of_a_commit_leaves_the_commit_before_or_t
         shutil.copytree(tmp_path / "base", folder)
         if not die_in_commit(dying, folder, len(steps)):
             break
-        memory = ReplayMemory(config.replay.capacity, (40, 40), budget_bytes=config.replay.max_bytes)
-        state, mark = Checkpoints(folder / "checkpoints", config.identity()).load(memory), read_commit(folder)
+        memory = ReplayMemory(dying.memory.capacity, (8, 8), budget_bytes=2**20)
+        checkpoints = Checkpoints(folder / "checkpoints", dying.checkpoints.identity)
+        state, mark = checkpoints.load(memory), read_commit(folder)
         assert state is not None
         assert mark is not None
         assert mark.offset <= state["tracker"]["offset"]  # nothing is shown that no checkpoint backs
         steps.append(state["counters"]["steps"])
         if continued:
-            after = started(config, folder)
+            after = begun(folder)
             after.run()
             assert fingerprint(after.state_dict(), after.memory, folder) == goal
     assert steps == sorted(steps)

@@ -6,10 +6,11 @@ from functools import partial
 import numpy as np
 import pytest
 
-from atlantis_exp.build import build_emulators, build_learner, make_emulator
+from atlantis_exp.build import build_learner, make_emulator
 from atlantis_exp.config import Config
+from atlantis_exp.game.vector import make_emulators
 from atlantis_exp.training.actor import Actor, EpsilonGreedy, RandomActor
-from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate, replay
+from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate
 
 Compose = Callable[..., Config]
 
@@ -17,9 +18,9 @@ Compose = Callable[..., Config]
 @pytest.fixture
 def played(tiny: Compose) -> Callable[..., Evaluation]:
     def play(num_envs: int, actor: Actor | None = None, **chosen: float) -> Evaluation:
-        env = tiny("env.workers=1", "env.max_steps=25").env
+        env = tiny("env.max_steps=25").env
         settings = {"episodes": 4, "epsilon": 0.5, "seed": 5, "size": env.size, "stack": env.stack, **chosen}
-        with build_emulators(env, num_envs) as emulators:
+        with make_emulators(make_emulator(env), num_envs, workers=0) as emulators:
             return evaluate(actor or RandomActor(4), emulators, **settings)  # type: ignore[arg-type]
 
     return play
@@ -57,36 +58,6 @@ def test_more_environments_than_episodes_play_each_episode_once(played: Callable
     assert told == [([min(step, 25), max(step - 25, 0)], step // 25) for step in range(1, 51)]
 
 
-def test_an_episode_can_be_seen_again_from_its_seed_and_actions(
-    tiny: Compose, played: Callable[..., Evaluation]
-) -> None:
-    episode = played(1).best
-    emulator = make_emulator(tiny("env.max_steps=25").env)()
-    moments = list(replay(episode, emulator, stack=4))
-    assert len(moments) == episode.steps + 1
-    assert moments[0].screen.shape == (210, 160, 3)
-    assert [moment.action for moment in moments] == [*episode.actions, None]
-    assert [moment.random for moment in moments[:-1]] == [bool(chance) for chance in episode.random]
-    emulator.reset(episode.seed)
-    steps = [emulator.step(action) for action in episode.actions]
-    assert sum(step.reward for step in steps) == episode.score == moments[-1].score
-    assert sum(step.frames for step in steps) == episode.frames
-    assert np.array_equal(moments[-1].screen, emulator.screen_rgb())
-
-
-def test_the_values_beside_a_film_are_those_that_the_network_decided_by(
-    tiny: Compose, played: Callable[..., Evaluation]
-) -> None:
-    learner = build_learner(tiny())
-    episode = played(1, EpsilonGreedy(learner.q_values, 4)).best
-    emulator = make_emulator(tiny("env.max_steps=25").env)()
-    asked = [moment for moment in replay(episode, emulator, 4, learner.q_values) if moment.action is not None]
-    decided = [moment for moment in asked if not moment.random]
-    assert 0 < len(decided) < len(asked)
-    assert all(moment.q_values is not None for moment in asked)
-    assert [moment.action for moment in decided] == [int(moment.q_values.argmax()) for moment in decided]  # type: ignore[union-attr]
-
-
 def test_the_actions_are_counted_by_who_chose_them() -> None:
     evaluation = Evaluation(
         0.1,
@@ -101,7 +72,7 @@ def test_the_actions_are_counted_by_who_chose_them() -> None:
     assert metrics["actions/random_share_best"] == 0.5
     assert metrics["actions/LEFTFIRE"] == 0.5
     assert (metrics["evaluation/mean"], metrics["evaluation/truncated_share"]) == (600, 0.5)
-    [first, second] = csv.DictReader(io.StringIO(evaluation.table()))
+    [first, second] = csv.DictReader(io.StringIO(evaluation.table().to_csv()))
     assert (first["score"], first["random"], first["FIRE"], second["truncated"]) == ("300.0", "1", "2", "1")
     assert evaluation.report() == (
         "eval:\n\navg score: 600.0  high score: 900.0  low score: 300.0\n\n"
@@ -145,8 +116,8 @@ def test_a_player_without_a_network_has_no_favourite(played: Callable[..., Evalu
 
 
 def test_the_score_is_told_apart_by_gun_where_a_step_s_reward_is_one_hit_s(tiny: Compose) -> None:
-    env = tiny("env.workers=1", "env.max_steps=700").env
-    with build_emulators(env, 2) as emulators:
+    env = tiny("env.max_steps=700").env
+    with make_emulators(make_emulator(env), 2, workers=0) as emulators:
         evaluation = evaluate(
             RandomActor(4), emulators, episodes=2, epsilon=0.0, seed=5, size=env.size, stack=env.stack
         )

@@ -1,25 +1,39 @@
-"""What a person is told about an evaluation."""
+"""What a person is told, and the pace of a training."""
 
 import io
-import itertools
-from types import SimpleNamespace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import pytest
 from rich.console import Console
 
 from atlantis_exp.training.evaluation import Episode, Evaluation
-from atlantis_exp.training.progress import Progress
+from atlantis_exp.training.progress import Pace, Progress, Snapshot
 
 
-def test_an_evaluation_says_how_far_it_is_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
-    text, clock = io.StringIO(), itertools.count(100, 4)  # seconds
-    monkeypatch.setattr("time.monotonic", lambda: next(clock))
+@dataclass
+class Clock:
+    """Shows the time that it is set to."""
+
+    now: float = 100.0  # seconds
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+def test_an_evaluation_says_how_far_it_is_now_and_then(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = io.StringIO()
+    monkeypatch.setattr("time.monotonic", clock)
     progress = Progress(Console(file=text, width=300))
     episodes = [Episode(0, 1_200.0), Episode(1), Episode(2)]
     for over in range(7):
         episodes[1].actions.append(0)
         progress.evaluating(episodes, over // 3)
+        clock.now += 4
     assert text.getvalue().splitlines() == [
         "  evaluation: 1 of 3 episodes over, 4 steps, highest score 1,200",
         "  evaluation: 2 of 3 episodes over, 7 steps, highest score 1,200",
@@ -32,7 +46,121 @@ def test_an_evaluation_says_how_far_it_is_now_and_then(monkeypatch: pytest.Monke
 )
 def test_an_early_score_below_random_is_explained(score: float, frames: int, explained: bool) -> None:
     text = io.StringIO()
-    trainer: Any = SimpleNamespace(counters=SimpleNamespace(steps=7, frames=frames))
-    Progress(Console(file=text, width=300)).evaluated(trainer, Evaluation(0.1, [Episode(0, score, 4)]))
+    Progress(Console(file=text, width=300)).evaluated(7, frames, Evaluation(0.1, [Episode(0, score, 4)]))
+    assert text.getvalue().startswith("step 7, 1 episodes evaluated at epsilon 0.1: ")
     assert f"mean {score:,.0f}" in text.getvalue()
     assert ("at 5 M frames published DQN is at 7,000 to 9,000" in text.getvalue()) == explained
+
+
+SNAPSHOT = Snapshot(
+    episode=1_013,
+    scores=[*[1_000.0] * 19, 3_000.0],
+    lengths=[790, 812],
+    epsilon=0.125,
+    steps=12_345,
+    updates=3_000,
+    steps_per_second=1_234.4,
+    phase="fast",
+    done=1_012,
+    length=8_000,
+    steps_left=930_000.9,
+)
+
+
+def line_of(snapshot: Snapshot) -> str:
+    text = io.StringIO()
+    Progress(Console(file=text, width=300)).show(snapshot)
+    return text.getvalue()
+
+
+def test_a_line_says_how_far_a_training_is() -> None:
+    assert line_of(SNAPSHOT) == (
+        "episode 1,013  score 3,000  mean of 20 1,100  duration 812 (mean of 100 801)  epsilon 0.12  "
+        "step 12,345  updates 3,000  1,234 steps/s  phase fast  12.7%  left 0:12:33\n"
+    )
+
+
+def test_the_line_of_a_first_episode_has_no_score_yet() -> None:
+    first = replace(
+        SNAPSHOT, episode=1, scores=[], lengths=[], steps=0, updates=0, steps_per_second=0.0, done=0, steps_left=None
+    )
+    assert line_of(first) == (
+        "episode 1  first episode  epsilon 0.12  step 0  updates 0  0 steps/s  phase fast  0.0%  left ?\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("steps_left", "steps_per_second", "left"),
+    [
+        (None, 10.0, "?"),
+        (100.0, 0.0, "?"),
+        (0.0, 10.0, "0:00:00"),
+        (-5.0, 10.0, "0:00:00"),
+        (36_005.0, 10.0, "1:00:00"),
+        (864_000.0, 10.0, "1 day, 0:00:00"),
+    ],
+)
+def test_the_time_left_follows_from_the_pace(steps_left: float | None, steps_per_second: float, left: str) -> None:
+    line = line_of(replace(SNAPSHOT, steps_left=steps_left, steps_per_second=steps_per_second))
+    assert line.endswith(f"  left {left}\n")
+
+
+@pytest.mark.parametrize(("terminal", "seconds", "at_once"), [(False, 10.0, False), (True, 0.25, True)])
+def test_a_training_is_shown_a_few_times_a_second_on_a_terminal_and_now_and_then_elsewhere(
+    clock: Clock, monkeypatch: pytest.MonkeyPatch, terminal: bool, seconds: float, at_once: bool
+) -> None:
+    monkeypatch.setattr("time.monotonic", clock)
+    progress = Progress(Console(file=io.StringIO(), width=300, force_terminal=terminal))
+    assert progress.is_due() == at_once
+    if at_once:
+        progress.show(SNAPSHOT)
+    clock.now += seconds - 0.125
+    assert not progress.is_due()
+    clock.now += 0.125
+    assert progress.is_due()
+    progress.show(SNAPSHOT)
+    assert not progress.is_due()
+    progress.close()
+
+
+def test_the_pace_is_that_of_the_last_half_minute(clock: Clock) -> None:
+    pace, steps = Pace(clock), 0
+    pace.tick(steps)
+    for second in range(120):
+        clock.now += 1
+        steps += 10 if second < 60 else 40
+        pace.tick(steps)
+        assert second >= 60 or pace.steps_per_second == 10
+    assert pace.steps_per_second == 40
+
+
+def test_before_two_ticks_there_is_no_pace(clock: Clock) -> None:
+    pace = Pace(clock)
+    assert pace.steps_per_second == 0
+    pace.tick(5_000)
+    assert pace.steps_per_second == 0
+    clock.now += 0.5
+    pace.tick(5_004)
+    assert pace.steps_per_second == 8
+
+
+def test_a_pause_counts_neither_as_time_nor_as_a_new_beginning(clock: Clock) -> None:
+    pace = Pace(clock)
+    pace.tick(0)
+    clock.now += 1
+    pace.tick(10)
+    with pace.paused():
+        clock.now += 1_000
+    assert pace.steps_per_second == 10
+    for steps in range(20, 320, 10):
+        clock.now += 1
+        pace.tick(steps)
+        assert pace.steps_per_second == pytest.approx(10)
+
+
+def test_steps_between_two_marks_count(clock: Clock) -> None:
+    pace = Pace(clock)
+    for steps in range(0, 100, 2):
+        pace.tick(steps)
+        clock.now += 0.001
+    assert pace.steps_per_second == pytest.approx(2_000)

@@ -1,0 +1,121 @@
+"""Plain mappings to checked configs, and mistakes to one line that names the key and the nearest valid choice."""
+
+import dataclasses
+import difflib
+import hashlib
+import json
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
+
+from atlantis_exp.faults import ConfigError
+
+T = TypeVar("T")
+
+
+def nearest(word: str, choices: Iterable[str]) -> str:
+    """The end of an error line: the closest of `choices`, then all of them when they are few."""
+    choices = sorted(choices)
+    close = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
+    listed = f" (valid: {', '.join(choices)})" if len(choices) <= 12 else ""
+    return (f"did you mean '{close[0]}'?" if close else "no valid choice is near") + listed
+
+
+def seconds(text: str | int) -> int:
+    """Return the seconds of a time such as 90, 90s, 10min, 3h or 1h30m, 0 where it is not readable."""
+    parts = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m(?:in)?)?(?:(\d+)s?)?", str(text))
+    hours, minutes, seconds = (int(part or 0) for part in parts.groups()) if parts else (0, 0, 0)
+    return 3600 * hours + 60 * minutes + seconds
+
+
+def check_server(key: str, uri: str | None) -> None:
+    """Raise ConfigError where a key holds no server's address."""
+    # It is written into files, which is no place for a password.
+    if uri is not None and not re.fullmatch(r"https?://[^\s@?#]+", uri):
+        raise ConfigError(
+            f"{key}: should be null or a server's address, as in http://127.0.0.1:5000; user and password "
+            "belong into the environment, as MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD"
+        )
+
+
+def parse(schema: type[T], tree: Mapping[str, Any]) -> T:
+    """Check a plain nested mapping against a schema class.
+
+    Raises:
+        ConfigError: one line for the first fault, with its dotted key and the nearest valid choice.
+    """
+    try:
+        # Through JSON: its strict mode takes a list for a tuple, which is all that YAML can write.
+        return TypeAdapter(schema).validate_json(json.dumps(tree))
+    except ValidationError as error:
+        raise ConfigError(_explain(error.errors(include_url=False), tree)) from None
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """A config as plain JSON-able containers."""
+    tree: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config)))
+    return tree
+
+
+def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Dotted keys to leaves; lists are leaves."""
+    leaves: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            leaves |= flatten(value, f"{prefix}{key}.")
+        else:
+            leaves[f"{prefix}{key}"] = value
+    return leaves
+
+
+def digest(tree: Mapping[str, Any]) -> str:
+    """Ten hexadecimal digits of a mapping's canonical JSON."""
+    return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:10]
+
+
+def _explain(faults: list[ErrorDetails], tree: Mapping[str, Any]) -> str:
+    """One line for the first fault of a tree, or for an unknown key if there is one."""
+    if isinstance(cause := faults[0].get("ctx", {}).get("error"), ConfigError):
+        return str(cause)
+    # A misspelt key shows twice, as one missing and one extra: the extra one is the user's.
+    fault = min(faults, key=lambda fault: fault["type"] != "unexpected_keyword_argument")
+    path, siblings, node = _locate(fault, tree)
+    key, kind = ".".join(path), fault["type"]
+    if kind == "unexpected_keyword_argument":
+        return f"{key}: no such key; {nearest(path[-1], set(siblings) - {path[-1]})}"
+    if kind in ("missing_argument", "missing"):
+        return f"{key}: missing, and it has no default"
+    if kind == "union_tag_invalid":
+        tags = str(fault["ctx"]["expected_tags"]).replace("'", "").split(", ")
+        given = str(fault["ctx"]["tag"])
+        return f"{key}.name={given}: no such choice; {nearest(given, tags)}"
+    if kind == "literal_error":
+        choices = str(fault["ctx"]["expected"]).replace("'", "").replace(" or ", ", ").split(", ")
+        return f"{key}={node}: no such choice; {nearest(str(node), choices)}"
+    # A key that may hold one type or another has a fault for each.
+    messages = [other["msg"] for other in faults if _locate(other, tree)[0] == path]
+    alternatives = dict.fromkeys(re.sub(r"^\w+ should ", "", message) for message in messages)
+    return f"{key}={json.dumps(node)}: should {' or '.join(alternatives)}"
+
+
+def _locate(fault: ErrorDetails, tree: Mapping[str, Any]) -> tuple[list[str], Mapping[str, Any], Any]:
+    """A fault's key as the user knows it, the mapping that holds it, and its value."""
+    path: list[str] = []
+    node: Any = tree
+    siblings: Mapping[str, Any] = tree
+    for part in fault["loc"]:
+        # Pydantic puts the name of a union's member into the path; only what the tree really holds is a key.
+        if isinstance(node, Mapping):
+            siblings = node
+            if part in node:
+                node = node[str(part)]
+                path.append(str(part))
+            elif fault["type"] in ("missing_argument", "missing") and part == fault["loc"][-1]:
+                path.append(str(part))
+        elif isinstance(node, list) and isinstance(part, int):
+            node = node[part] if part < len(node) else None
+            path.append(str(part))
+    return path, siblings, node

@@ -1,0 +1,212 @@
+"""Overrides as typed, checked before anything is composed for good: keys, options, sweeps, launchers."""
+
+import argparse
+import itertools
+import re
+import shutil
+from collections.abc import Iterator, Sequence
+from functools import cache
+from importlib import import_module
+from typing import TypeVar
+
+from hydra import compose
+from hydra._internal.utils import get_args_parser
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException, MissingConfigException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
+
+from atlantis_exp.checking import flatten, nearest
+from atlantis_exp.commands.composing import CONF, checked, composing
+from atlantis_exp.faults import ConfigError
+from atlantis_exp.sessions.launchers import BASIC, Launcher
+
+T = TypeVar("T")
+
+
+def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[tuple[str, ...], T]:
+    """Compose and check every job that a command line asks for: their configs by their overrides; writes nothing.
+
+    Raises:
+        ConfigError: one line for the first mistake, with the nearest valid choice or the valid range.
+    """
+    texts, multirun = read_flags(arguments)
+    overrides = [read_override(text) for text in texts]
+    for override in overrides:
+        if override.is_sweep_override() and not multirun:
+            raise ConfigError(f"{override.input_line}: several values are a sweep; add -m")
+    hydras = [override for override in overrides if _is_hydras(override)]
+    overrides = [override for override in overrides if not _is_hydras(override)]
+    try:
+        with composing():
+            if hydras:
+                _check_launcher(config_name, hydras)
+            return {tuple(job): _check_job(config_name, schema, job) for job in _jobs(overrides)}
+    except (HydraException, OmegaConfBaseException) as error:
+        reason = f": {error.__cause__}" if isinstance(error.__cause__, OmegaConfBaseException) else ""
+        raise ConfigError(" ".join(re.split("Config search path|full_key:", f"{error}{reason}")[0].split())) from None
+
+
+def swept(arguments: Sequence[str]) -> list[str]:
+    """The overrides of a command line that name several values. Raises: ConfigError."""
+    return [text for text in read_flags(arguments)[0] if read_override(text).is_sweep_override()]
+
+
+def launcher(config_name: str, arguments: Sequence[str]) -> Launcher:
+    """The launcher of a sweep that a command line asks for. Raises: ConfigError."""
+    texts, multirun = read_flags(arguments)
+    hydras = [text for text in texts if _is_hydras(read_override(text))]
+    if not multirun or not hydras:
+        return BASIC
+    with composing():
+        settings = compose(config_name, hydras, return_hydra_config=True).hydra
+    name, n_jobs = settings.runtime.choices["hydra/launcher"], OmegaConf.select(settings, "launcher.n_jobs")
+    if (ray := OmegaConf.select(settings, "launcher.ray.init")) is None:
+        return Launcher(name, n_jobs)
+    return Launcher(name, n_jobs, {str(key): ray[key] for key in ray})
+
+
+def _check_launcher(config_name: str, overrides: list[Override]) -> None:
+    """Check what the command line tells Hydra itself, above all of the launcher."""
+    texts = {str(override.input_line): override for override in overrides}
+    choices = [text for text, override in texts.items() if "/" in override.key_or_group]
+    try:
+        settings = compose(config_name, choices, return_hydra_config=True).hydra
+        name, target = settings.runtime.choices["hydra/launcher"], settings.launcher._target_
+        import_module(target.rpartition(".")[0])
+    except ImportError:
+        raise ConfigError(f"hydra/launcher={name}: needs pip install 'atlantis-exp[{name}]'") from None
+    except MissingConfigException as error:  # the plugin's own, which the preset is made of
+        if error.missing_cfg_file != "hydra/launcher/submitit_slurm":
+            raise
+        raise ConfigError("hydra/launcher=slurm: needs pip install 'atlantis-exp[slurm]'") from None
+    if target.endswith(".SlurmLauncher") and shutil.which("srun") is None:
+        raise ConfigError(f"hydra/launcher={name}: there is no srun here; submit from a machine of the cluster")
+    keys = {f"hydra.launcher.{key}" for key in settings.launcher}
+    for text, override in texts.items():
+        key = ".".join(override.key_or_group.split(".")[:3])  # what is below, the user names
+        if key.startswith("hydra.launcher.") and key not in keys:
+            raise ConfigError(f"{text}: no such key; {nearest(key, keys)}")
+    compose(config_name, list(texts), return_hydra_config=True)
+
+
+def read_flags(arguments: Sequence[str]) -> tuple[list[str], bool]:
+    """The overrides of a command line, and whether it is a sweep. Raises: ConfigError."""
+    parser = get_args_parser()
+    parser.exit_on_error = parser.allow_abbrev = False
+    try:
+        flags, unknown = parser.parse_known_args(list(arguments))
+    except argparse.ArgumentError as error:
+        raise ConfigError(" ".join(str(error).split())) from None
+    if unknown:
+        if not unknown[0].startswith("-"):
+            raise ConfigError(f"{unknown[0]}: write all overrides together, before or after the flags")
+        known = {option for action in parser._actions for option in action.option_strings}
+        raise ConfigError(f"{unknown[0]}: no such flag; {nearest(unknown[0], known)}")
+    for flag in ("config_path", "config_name", "config_dir", "experimental_rerun"):
+        if getattr(flags, flag) is not None:
+            raise ConfigError(f"--{flag.replace('_', '-')}: the verb decides on its config; write overrides instead")
+    sweep = flags.multirun or "hydra.mode=MULTIRUN" in flags.overrides
+    return flags.overrides, sweep
+
+
+def read_override(text: str) -> Override:
+    """An override as Hydra understands it. Raises: ConfigError."""
+    if "=" not in text and not text.startswith("~"):
+        raise ConfigError(f"'{text}' is no override; write KEY=VALUE, as in model=resnet")
+    try:
+        return OverridesParser.create().parse_override(text)
+    except HydraException:
+        raise ConfigError(
+            f"{text}: not readable; write KEY=VALUE, a list as KEY=[1,2], other characters in quotes as KEY='\"a ü\"'"
+        ) from None
+
+
+def _is_hydras(override: Override) -> bool:
+    return override.key_or_group.startswith(("hydra.", "hydra/"))
+
+
+def _jobs(overrides: list[Override]) -> Iterator[list[str]]:
+    """The overrides of each job of a sweep (of the one job without a sweep)."""
+    choices = []
+    for override in overrides:
+        if override.is_sweep_override():
+            key = str(override.input_line).split("=", 1)[0]
+            choices.append([f"{key}={value}" for value in override.sweep_string_iterator()])
+        else:
+            choices.append([str(override.input_line)])
+    for combination in itertools.product(*choices):
+        yield list(combination)
+
+
+def _check_job(config_name: str, schema: type[T], texts: list[str]) -> T:
+    overrides = {text: read_override(text) for text in texts}
+    groups = _groups(config_name)
+    chosen = tuple(text for text, override in overrides.items() if _key(override) in groups)
+    for text in chosen:
+        override = overrides[text]
+        folder, value = override.key_or_group, override.value()
+        options = {path.stem for path in (CONF / folder).glob("*.yaml")}
+        if override.is_delete():
+            raise ConfigError(f"{text}: needed; choose with {folder}=OPTION (valid: {', '.join(sorted(options))})")
+        if not isinstance(value, str) or value not in options:
+            raise ConfigError(f"{folder}={value}: no such option in conf/{folder}; {nearest(str(value), options)}")
+    keys = _keys(config_name, chosen)
+    branches = {key.rsplit(".", depth)[0] for key in keys for depth in range(1, key.count(".") + 1)}
+    for text, override in overrides.items():
+        if text in chosen:
+            continue
+        key = _key(override)
+        if key not in keys | branches:
+            raise ConfigError(f"{text}: no such key; {_nearest_key(key, keys | branches | groups)}")
+        if override.is_add() and key in keys:
+            raise ConfigError(f"{text}: the key is there already; write {text.removeprefix('+')}")
+        if override.is_delete() and not key.startswith("phase."):
+            raise ConfigError(f"{text}: needed; change it with {key}=VALUE")
+    try:
+        return checked(schema, _composed(config_name, tuple(texts)))
+    except InterpolationKeyError as error:
+        missing = "".join(re.findall("'(.*)'", str(error)))
+        raise ConfigError(f"${{{missing}}}: no such key; {_nearest_key(missing, keys)}") from None
+
+
+@cache
+def _composed(config_name: str, texts: tuple[str, ...]) -> DictConfig:
+    return compose(config_name, list(texts))
+
+
+@cache
+def _keys(config_name: str, chosen: tuple[str, ...]) -> frozenset[str]:
+    """The keys that options of groups give, which many jobs of a sweep share."""
+    tree = OmegaConf.to_container(_composed(config_name, chosen))
+    assert isinstance(tree, dict)
+    return frozenset(flatten({str(key): value for key, value in tree.items()}))
+
+
+def _groups(config_name: str) -> set[str]:
+    """The groups of a verb's defaults list, with the package that they fill: `model`, `sampler@samplers.uniform`."""
+    config = OmegaConf.load(CONF / f"{config_name}.yaml")
+    assert isinstance(config, DictConfig)
+    groups: set[str] = set()
+    for entry in config.get("defaults", ()):
+        if isinstance(entry, DictConfig):
+            groups |= {str(group) for group in entry}
+        elif entry != "_self_":
+            groups |= _groups(entry)
+    return groups
+
+
+def _key(override: Override) -> str:
+    return override.key_or_group + (f"@{override.package}" if override.package else "")
+
+
+def _nearest_key(key: str, keys: frozenset[str]) -> str:
+    """The nearest key of the same parent, or of any depth; a bare name is compared with last parts, too, as `lr` with
+    `optimizer.lr`."""
+    parent = key.rpartition(".")[0]
+    siblings = {known for known in keys if parent and known.rpartition(".")[0] == parent}
+    exact = sorted(known for known in keys if known.rsplit(".", 1)[-1] == key.rsplit(".", 1)[-1])
+    if exact and not siblings:
+        return f"did you mean '{exact[0]}'?"
+    return nearest(key, siblings or keys)

@@ -1,0 +1,56 @@
+"""The table of evaluated episodes: what an evaluation writes and a comparison reads, one row an episode."""
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EpisodeTable:
+    """Evaluated episodes, one row each."""
+
+    actions: tuple[str, ...]
+    seeds: npt.NDArray[np.int64]  # (episodes,), of the emulators
+    scores: Array  # (episodes,)
+    steps: Array  # (episodes,)
+    frames: Array  # (episodes,)
+    truncated: Array  # (episodes,), 1 where the time cap ended it
+    counts: Array  # steps, (episodes, actions, 2): chosen by the network, by chance
+
+    def to_csv(self) -> str:
+        """The table with a header; steps by action, and those of them that chance chose."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        by_chance = [f"{action}_random" for action in self.actions]
+        head = ("episode", "seed", "score", "steps", "frames", "truncated", "random", *self.actions, *by_chance)
+        writer.writerow(head)
+        for index, counts in enumerate(self.counts.astype(np.int64)):
+            ends = (int(column[index]) for column in (self.steps, self.frames, self.truncated))
+            row = (index, int(self.seeds[index]), float(self.scores[index]), *ends, int(counts[:, 1].sum()))
+            writer.writerow((*row, *counts.sum(1).tolist(), *counts[:, 1].tolist()))
+        return text.getvalue()
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """The table in a file. Raises: ValueError, OSError."""
+        with open(path, newline="") as file:
+            rows = list(csv.DictReader(file))
+        if not rows:
+            raise ValueError(f"{path} has no episode")
+        actions = tuple(name.removesuffix("_random") for name in rows[0] if name.endswith("_random"))
+        if not actions:
+            raise ValueError(f"{path} does not say who chose the actions: play it again")
+        chance = np.array([[float(row[f"{action}_random"]) for action in actions] for row in rows])
+        both = np.array([[float(row[action]) for action in actions] for row in rows])
+        scores, steps, frames, truncated = (
+            np.array([float(row[name]) for row in rows]) for name in ("score", "steps", "frames", "truncated")
+        )
+        seeds = np.array([int(row["seed"]) for row in rows])
+        return cls(actions, seeds, scores, steps, frames, truncated, np.stack((both - chance, chance), axis=2))

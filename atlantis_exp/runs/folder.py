@@ -1,0 +1,202 @@
+"""Run folders: where a run lives, what its files are called, who holds it, and how it ended."""
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, Self, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from atlantis_exp.checking import nearest, parse
+from atlantis_exp.config import Config
+from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.runs import lock
+from atlantis_exp.runs.journal import Commit, Status, read_commit, write_file
+
+CONFIG, RESULT, COMMIT = "config.json", "result.json", "commit.json"
+TRACEBACK = "traceback.txt"
+"""Why a run failed last, at length."""
+CHECKPOINTS = "checkpoints"
+"""The folder of a training's checkpoints."""
+OUTPUT = "output.txt"
+"""What a run that a launcher started printed."""
+
+# Names of artifacts.
+EPISODES = "episodes.csv"  # of the training
+BEST_WEIGHTS, BEST_EPISODE = "best.safetensors", "best_episode.mp4"
+EVALUATION, EVALUATION_REPORT = "evaluation/episodes.csv", "evaluation/report.txt"  # of a run that is one evaluation
+
+_HOLD_SECONDS = 2.0  # that a command waits for a run, which another may hold for a moment
+
+State = Literal["done", "running", "failed", "interrupted", "missing"]
+T = TypeVar("T")
+
+
+def evaluation_at(step: int) -> str:
+    """The artifact with the episodes of a training's evaluation at a step."""
+    return f"evaluation/{step:09d}.csv"
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a run ended: the numbers of its last evaluation and the report's table of them."""
+
+    outcome: str
+    steps: int
+    counts: dict[str, float]  # episodes, frames, updates and hours of a training
+    evaluation: dict[str, float]
+    report: str
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """One run's folder: `config.json` at its start, `result.json` at its end, journal and checkpoints in between.
+
+    Reading a file of it that is damaged raises Fault.
+    """
+
+    path: Path
+
+    @classmethod
+    def of(cls, config: Config) -> Self:
+        """The folder of the training that a config is."""
+        return cls(Path(config.paths.outputs) / "runs" / config.run_name())
+
+    @property
+    def name(self) -> str:
+        """The run's name."""
+        return self.path.name
+
+    @property
+    def checkpoints(self) -> Path:
+        """The folder of the training's checkpoints."""
+        return self.path / CHECKPOINTS
+
+    def artifact(self, name: str) -> Path:
+        """A file that the journal names."""
+        return self.path / "artifacts" / name
+
+    @property
+    def has_started(self) -> bool:
+        """Whether there is anything to continue."""
+        return (self.path / CONFIG).exists()
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The composed config, empty before the run's start."""
+        return _read(self.path / CONFIG, _CONFIG) or {}
+
+    @property
+    def trained_config(self) -> Config:
+        """The config of a training run. Raises: ConfigError, naming its file."""
+        try:
+            return parse(Config, self.config)
+        except ConfigError as error:
+            raise ConfigError(f"{self.path / CONFIG}: {error}") from None
+
+    @property
+    def result(self) -> Result | None:
+        """How the run ended, None before its end."""
+        return _read(self.path / RESULT, _RESULT)
+
+    def ended(self, budget: int | None) -> Result | None:
+        """How the run has ended, None if it goes on: it has not, or did by its budget of steps and has now a larger."""
+        if not self.has_started or (result := self.result) is None:
+            return None
+        return None if result.outcome == "budget" and (budget is None or budget > result.steps) else result
+
+    @property
+    def commit(self) -> Commit | None:
+        """What the run's writer last committed, None before its first commit or status."""
+        return read_commit(self.path)
+
+    @property
+    def title(self) -> str:
+        """What people call the run."""
+        return commit.labels.get("mlflow.runName", self.name) if (commit := self.commit) else self.name
+
+    @property
+    def status(self) -> Status | None:
+        """What the run last said of itself, None before it said anything."""
+        return commit.status if (commit := self.commit) else None
+
+    @property
+    def error(self) -> str:
+        """Why the run failed, empty if it did not."""
+        return commit.error if (commit := self.commit) else ""
+
+    @property
+    def parent(self) -> Path | None:
+        """The folder of the sweep that the run was last part of."""
+        return self.path / commit.parent if (commit := self.commit) and commit.parent else None
+
+    @property
+    def state(self) -> State:
+        """How far the run is; one whose process was killed is interrupted, whatever its journal says."""
+        if not self.has_started:
+            return "failed" if self.status == "FAILED" else "missing"
+        if self.result is not None:
+            return "done"
+        if self.status == "FAILED":
+            return "failed"
+        has_ended = self.status not in (None, "SCHEDULED", "RUNNING")
+        return "running" if not has_ended and self.is_held else "interrupted"
+
+    @property
+    def is_held(self) -> bool:
+        """Whether a process holds the run."""
+        return lock.is_held(self.path)
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold the run against other processes. Raises: Fault, naming the one that holds it."""
+        with lock.held(self.path, f"run {self.name}", _HOLD_SECONDS):
+            yield
+
+    def write_config(self, config: Mapping[str, Any]) -> None:
+        """Keep the composed config."""
+        write_file(self.path / CONFIG, json.dumps(config, indent=2).encode())
+
+    def write_result(self, result: Result) -> None:
+        """Keep how the run ended."""
+        write_file(self.path / RESULT, json.dumps(asdict(result), indent=2).encode())
+
+
+def all_folders(outputs: Path) -> list[RunFolder]:
+    """All folders under `outputs` with a journal, be they of runs, sweeps, searches, evaluations or comparisons."""
+    return [RunFolder(path.parent) for path in sorted(outputs.glob(f"*/*/{COMMIT}"))]
+
+
+def all_runs(outputs: Path) -> list[RunFolder]:
+    """All runs that have started, by name."""
+    return [RunFolder(path.parent) for path in sorted((outputs / "runs").glob(f"*/{CONFIG}"))]
+
+
+def find_run(outputs: Path, name: str) -> RunFolder:
+    """The training run of that name, that start of a name, or the latest. Raises: ConfigError."""
+    folders = [folder for folder in all_runs(outputs) if "model" in folder.config]
+    if not folders:
+        raise ConfigError(f"run={name}: there is no training run under {outputs / 'runs'}")
+    if name == "latest":
+        return max(folders, key=lambda folder: (folder.path / CONFIG).stat().st_mtime)
+    matching = [folder for folder in folders if folder.name == name] or [
+        folder for folder in folders if folder.name.startswith(name)
+    ]
+    if len(matching) == 1:
+        return matching[0]
+    if matching:
+        raise ConfigError(f"run={name}: could be any of {', '.join(folder.name for folder in matching)}")
+    raise ConfigError(f"run={name}: no such run; {nearest(name, {folder.name for folder in folders})}")
+
+
+def _read(path: Path, schema: TypeAdapter[T]) -> T | None:
+    try:
+        return schema.validate_json(path.read_bytes(), strict=True) if path.exists() else None
+    except ValidationError:
+        raise Fault(f"{path} is damaged: remove it and issue the run's command again, which writes it anew") from None
+
+
+_RESULT = TypeAdapter(Result)
+_CONFIG = TypeAdapter(dict[str, Any])

@@ -1,0 +1,454 @@
+"""The journal of a run: what happened, durable, exactly once.
+
+A run folder holds `journal.jsonl` (one record a line), `artifacts/` (the files that records name) and `commit.json`
+(how much of the journal counts). Lines become durable with `Journal.state_dict`, and visible with `Journal.commit` once
+a checkpoint holds that state. A resumed run redoes what came later and journals it again, so nothing appears twice.
+"""
+
+import json
+import os
+import re
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, BinaryIO, Literal, Protocol, get_args
+from uuid import uuid4
+
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import from_json
+
+from atlantis_exp.faults import RunFault
+
+Status = Literal["SCHEDULED", "RUNNING", "FINISHED", "FAILED", "KILLED"]
+NOTE = "mlflow.note.content"
+"""The tag that MLflow shows as markdown at the top of a run's page."""
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Values measured at one step; `time` is in ms since 1970 and never decreases along a journal."""
+
+    step: int
+    time: int
+    values: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Params:
+    """What the run was asked to do."""
+
+    values: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Tags:
+    """What is said about the run; a later value replaces an earlier one."""
+
+    values: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """A file under `artifacts/`."""
+
+    path: str
+
+
+@dataclass(frozen=True)
+class Image:
+    """A PNG under `artifacts/`: one position, which MLflow calls a step, of the slider of `key`."""
+
+    key: str
+    step: int
+    time: int
+    path: str
+
+
+@dataclass(frozen=True)
+class Model:
+    """Weights as safetensors under `artifacts/`, with the metrics that they reached."""
+
+    name: str
+    step: int
+    time: int
+    path: str
+    values: dict[str, float]
+    best: bool = False  # of all of its name so far
+
+
+Record = Metrics | Params | Tags | Artifact | Image | Model
+_KINDS: dict[str, type[Record]] = {kind.__name__.lower(): kind for kind in get_args(Record)}
+
+
+@dataclass(frozen=True)
+class Commit:
+    """How much of a journal counts, and what state its run is in.
+
+    `identity` is unique to the run and changes when committed lines are taken back; `started` and `updated` are in ms
+    since 1970, `offset` in bytes. `labels` are tags that hold from a run's first moment, even if it fails before
+    anything is committed; `error` is why it failed; `parent` is the folder, seen from this one, of the run that it is
+    shown under.
+    """
+
+    identity: str
+    started: int
+    updated: int
+    offset: int
+    status: Status
+    error: str = ""
+    labels: dict[str, str] = field(default_factory=dict)
+    parent: str = ""
+
+
+class JournalError(RunFault, ValueError):
+    """A journal that cannot be continued from."""
+
+
+_COMMIT = TypeAdapter(Commit)
+_POINT_BYTES = 2_000  # between two points of a curve that are worth reading; three lines of a journal, or so
+
+
+class Tracker(Protocol):
+    """What training may tell about itself."""
+
+    def metrics(self, values: Mapping[str, float], step: int) -> None:
+        """Records values measured at a step."""
+
+    def params(self, values: Mapping[str, str]) -> None:
+        """Records what the run was asked to do."""
+
+    def tags(self, values: Mapping[str, str]) -> None:
+        """Records what is said about the run."""
+
+    def note(self, markdown: str) -> None:
+        """Describes the run and its result so far; the last note counts."""
+
+    def artifact(self, path: str, content: bytes) -> None:
+        """Keeps a file under a relative path; the last content of a path counts."""
+
+    def image(self, key: str, content: bytes, step: int) -> None:
+        """Keeps a PNG at a position of its key's slider; runs that share positions are shown side by side."""
+
+    def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None:
+        """Keeps weights (safetensors) of a step and the metrics that they reached; `best` of all of the name so far."""
+
+    def status(self, status: Status, error: str = "") -> None:
+        """Says what state the run is in and why it failed, and reveals nothing else."""
+
+    def commit(self) -> None:
+        """Reveals all that the latest state holds; to be called once a checkpoint holding it is durable."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Makes all records durable and returns where they end."""
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes back to where the state ends; later records are forgotten."""
+
+
+class NullJournal:
+    """A tracker that forgets everything."""
+
+    def metrics(self, values: Mapping[str, float], step: int) -> None: ...
+    def params(self, values: Mapping[str, str]) -> None: ...
+    def tags(self, values: Mapping[str, str]) -> None: ...
+    def note(self, markdown: str) -> None: ...
+    def artifact(self, path: str, content: bytes) -> None: ...
+    def image(self, key: str, content: bytes, step: int) -> None: ...
+    def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None: ...
+    def status(self, status: Status, error: str = "") -> None: ...
+    def commit(self) -> None: ...
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None: ...
+
+
+class Journal:
+    """A tracker that writes a run folder, which has one writer at a time.
+
+    Without `load_state_dict` it begins an empty journal, even in a folder that holds one. Names of metrics, params,
+    tags, images and models are checked against MLflow's alphabet, so that publishing cannot stumble over them later.
+
+    Raises:
+        JournalError: on a folder whose `commit.json` is damaged.
+        ValueError: on a name that MLflow would refuse, or a path that leads out of `artifacts/`.
+        OSError: from `state_dict` when the disk refuses; what was durable stays so, and a later call writes the rest.
+    """
+
+    def __init__(self, folder: Path, labels: Mapping[str, str] | None = None) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder = folder
+        self._time = _now()  # ms, of the latest metrics
+        self._offset = 0  # bytes that are durable and that the state speaks for
+        self._lines: list[bytes] = []  # after the last checkpoint: would be redone, so memory suffices
+        commit = read_commit(folder) or _unborn()
+        if commit.status == "SCHEDULED":
+            commit = replace(commit, started=self._time, status="RUNNING")
+        named = {_name(key): value for key, value in (labels or {}).items()}
+        self._commit = replace(commit, labels={**commit.labels, **named})
+
+    def resume(self) -> bool:
+        """Goes on behind what is committed, as a writer without checkpoints does; whether there is anything."""
+        if not self._commit.offset:
+            return False
+        self.load_state_dict({"offset": self._commit.offset, "time": self._commit.updated})
+        return True
+
+    def metrics(self, values: Mapping[str, float], step: int) -> None:
+        self._time = max(self._time, _now())
+        self._append(Metrics(step, self._time, {_name(key): float(value) for key, value in values.items()}))
+
+    def params(self, values: Mapping[str, str]) -> None:
+        self._append(Params({_name(key): value for key, value in values.items()}))
+
+    def tags(self, values: Mapping[str, str]) -> None:
+        self._append(Tags({_name(key): value for key, value in values.items()}))
+
+    def note(self, markdown: str) -> None:
+        self.tags({NOTE: markdown})
+
+    def artifact(self, path: str, content: bytes) -> None:
+        write_file(_inside(self._folder, path), content)
+        self._append(Artifact(path))
+
+    def image(self, key: str, content: bytes, step: int) -> None:
+        path = f"images/{_name(key)}/{step}.png"
+        write_file(_inside(self._folder, path), content)
+        self._append(Image(key, step, self._time, path))
+
+    def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None:
+        if set("/.") & set(name):
+            raise ValueError(f"A model's name holds neither '/' nor '.': {name!r}")
+        path = f"models/{_name(name)}/{step}.safetensors"
+        write_file(_inside(self._folder, path), content)
+        # MLflow charts a model's metrics on the run as well: with the time of the metrics just recorded they are the
+        # same points, not second ones.
+        values = {_name(key): float(value) for key, value in metrics.items()}
+        self._append(Model(name, step, self._time, path, values, best))
+
+    def status(self, status: Status, error: str = "") -> None:
+        self._mark(replace(self._commit, status=status, error=error))
+
+    def commit(self) -> None:
+        self._mark(replace(self._commit, offset=self._offset))
+
+    def flush(self) -> None:
+        """Makes all records durable and visible; for a writer without checkpoints."""
+        self.state_dict()
+        self.commit()
+
+    def finish(self) -> None:
+        """Makes all records durable and visible, and says that there will be no more."""
+        self.flush()
+        self.status("FINISHED")
+
+    def state_dict(self) -> dict[str, Any]:
+        if self._offset < self._commit.offset:
+            self._mark(replace(self._commit, offset=self._offset))  # readers first: the bytes change under them next
+        content = b"".join(self._lines)
+        with open(self._folder / "journal.jsonl", "ab") as file:
+            file.truncate(self._offset)
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        self._offset += len(content)
+        self._lines.clear()
+        return {"offset": self._offset, "time": self._time}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        path = self._folder / "journal.jsonl"
+        if path.stat().st_size < state["offset"]:
+            raise JournalError(f"{path} is shorter than the checkpoint says: it was cut or replaced since")
+        self._offset, self._time = state["offset"], state["time"]
+        self._lines.clear()
+
+    def _append(self, record: Record) -> None:
+        line = _encode({"kind": type(record).__name__.lower(), **vars(record)})
+        self._lines.append(line.encode() + b"\n")
+
+    def _mark(self, commit: Commit) -> None:
+        # What was visible cannot be unsent: a journal that goes back behind its commit is a new run to its readers.
+        identity = self._commit.identity if commit.offset >= self._commit.offset else uuid4().hex
+        self._commit = replace(commit, identity=identity, updated=_now())
+        _write_commit(self._folder, self._commit)
+
+
+def read_commit(folder: Path) -> Commit | None:
+    """Returns what the run folder's writer last committed, None before its first commit or status.
+
+    Raises:
+        JournalError: on a file that no writer left so; without it the whole journal is a new run to its readers.
+    """
+    path = folder / "commit.json"
+    try:
+        return commit_of(path.read_bytes()) if path.exists() else None
+    except JournalError:
+        raise JournalError(f"{path} is damaged: remove it and issue the run's command again") from None
+
+
+def commit_of(content: bytes) -> Commit:
+    """Returns the commit that the bytes of a `commit.json` say. Raises: JournalError."""
+    try:
+        return _COMMIT.validate_json(content, strict=True)
+    except ValidationError:
+        raise JournalError("this is no commit.json") from None
+
+
+def commit_bytes(commit: Commit) -> bytes:
+    """Returns the `commit.json` of a commit."""
+    return _encode(asdict(commit)).encode()
+
+
+def adopt(folder: Path, parent: Path) -> None:
+    """Puts a run, which may have yet to start, under another one; nobody may be writing its folder.
+
+    Raises:
+        JournalError: on a folder whose `commit.json` is damaged.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    commit = read_commit(folder) or _unborn()
+    adopted = replace(commit, parent=os.path.relpath(parent, folder))
+    if adopted != commit:
+        _write_commit(folder, adopted)
+
+
+def restore(folder: Path, start: int, pieces: Iterable[bytes]) -> None:
+    """Continues a run folder's journal from an offset with bytes of another copy of it; `commit.json` makes them count.
+
+    The caller holds the folder, and what is committed in it ends at `start` or before.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / "journal.jsonl", "ab") as file:
+        file.truncate(start)
+        file.writelines(pieces)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read(folder: Path, start: int = 0, end: int | None = None) -> Iterator[tuple[int, Record]]:
+    """Yields the committed records between two offsets, each with the offset where it ends.
+
+    Args:
+        start: bytes; where a record begins.
+        end: bytes; None means the last commit.
+
+    Raises:
+        ValueError: on a journal that ends before `end`, an unknown kind of record, or a path out of `artifacts/`.
+    """
+    if end is None:
+        commit = read_commit(folder)
+        end = commit.offset if commit else 0
+    if start >= end:
+        return
+    with open(folder / "journal.jsonl", "rb") as file:
+        file.seek(start)
+        while start < end:
+            line = file.readline()
+            if not line.endswith(b"\n"):
+                raise ValueError(f"{file.name} ends at byte {start + len(line)}, before its commit at {end}")
+            fields = json.loads(line)
+            kind = fields.pop("kind")
+            if kind not in _KINDS:
+                raise ValueError(f"{file.name} holds a record of unknown kind {kind!r} at byte {start}")
+            if "path" in fields:
+                _inside(folder, fields["path"])
+            start += len(line)
+            yield start, _KINDS[kind](**fields)
+
+
+def curve(folder: Path, keys: Sequence[str], points: int = 500) -> Iterator[Metrics]:
+    """Yields the committed metrics that hold all of some keys, of a long journal about `points` of them.
+
+    A journal of over 2,000 bytes a point is cut into as many stretches of equal length, and the first in each is taken;
+    the first and the last of all are always among them. So a history's length costs nothing.
+
+    Raises:
+        ValueError: as `read`.
+    """
+    commit = read_commit(folder)
+    end = commit.offset if commit else 0
+    if end <= points * _POINT_BYTES:
+        for _, record in read(folder):
+            if isinstance(record, Metrics) and record.values.keys() >= set(keys):
+                yield record
+        return
+    with open(folder / "journal.jsonl", "rb", buffering=_POINT_BYTES) as file:
+        last = 0  # bytes, where the latest point taken ends
+        for stretch in range(points):
+            start, stop = stretch * end // points, (stretch + 1) * end // points
+            if point := next(_points(file, keys, start, stop), None):
+                last, line = point
+                yield _metrics(line)
+        *_, point = (None, *_points(file, keys, last, end))
+        if point:
+            yield _metrics(point[1])
+
+
+def _points(file: BinaryIO, keys: Sequence[str], start: int, stop: int) -> Iterator[tuple[int, bytes]]:
+    """Yields the lines with metrics of all keys that begin between two offsets, each with the offset where it ends."""
+    kind, wanted = b'{"kind":"metrics",', [f"{_encode(key)}:".encode() for key in keys]
+    file.seek(max(start - 1, 0))
+    position = start if start == 0 else start - 1 + len(file.readline())  # a line's beginning
+    while position < stop:
+        line = file.readline()
+        if not line.endswith(b"\n"):
+            raise ValueError(f"{file.name} ends at byte {position + len(line)}, before its commit")
+        position += len(line)
+        if line.startswith(kind) and all(key in line for key in wanted):
+            yield position, line
+
+
+def _metrics(line: bytes) -> Metrics:
+    fields = from_json(line)  # four times as fast as `json`
+    del fields["kind"]
+    return Metrics(**fields)
+
+
+def _unborn() -> Commit:
+    return Commit(uuid4().hex, _now(), _now(), 0, "SCHEDULED")
+
+
+def _write_commit(folder: Path, commit: Commit) -> None:
+    write_file(folder / "commit.json", commit_bytes(commit))
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Puts a file in place whole, durably, or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(path.name + ".aside")
+    with open(aside, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    aside.replace(path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def _inside(folder: Path, path: str) -> Path:
+    root = (folder / "artifacts").resolve()
+    file = (root / path).resolve()
+    if root not in file.parents:
+        raise ValueError(f"The path {path!r} does not name a file inside {root}")
+    return file
+
+
+@lru_cache(maxsize=4096)
+def _name(name: str) -> str:
+    if len(name) > 250 or not re.fullmatch(r"\w[\w.\- ]*(/\w[\w.\- ]*)*", name, re.ASCII):
+        raise ValueError(
+            f"MLflow takes letters, digits, '_.- ' and single inner slashes, 250 in all, as a name: {name!r}"
+        )
+    return name
+
+
+def _now() -> int:
+    return time.time_ns() // 1_000_000  # ms
+
+
+_encode = json.JSONEncoder(separators=(",", ":")).encode

@@ -1,0 +1,49 @@
+"""Who holds a folder: one process at a time, until it ends, however it does."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from atlantis_exp.faults import Fault
+
+_HOLDER = "holder.txt"  # not the lock itself, which is emptied by whoever asks for it
+
+
+@contextmanager
+def held(folder: Path, name: str, seconds: float) -> Iterator[None]:
+    """Hold a folder, which is made if need be, after waiting for it as long as that.
+
+    Raises:
+        Fault: naming the process that holds it; exit code 75.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        lock = FileLock(folder / "lock").acquire(seconds)
+    except Timeout:
+        holder = (folder / _HOLDER).read_text() if (folder / _HOLDER).exists() else "another process"
+        raise Fault(f"{name} is held by {holder.strip()}", exit_code=75) from None
+    with lock:
+        (folder / _HOLDER).write_text(f"process {os.getpid()} on {os.uname().nodename}\n")
+        yield
+
+
+def is_held(folder: Path) -> bool:
+    """Whether a process holds a folder."""
+    if not (folder / "lock").exists():
+        return False
+    try:
+        with FileLock(folder / "lock").acquire(blocking=False):
+            return False
+    except Timeout:
+        return True
+
+
+@contextmanager
+def alone(path: Path) -> Iterator[None]:
+    """Wait for a lock file and keep all other processes out of the block."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(path):
+        yield

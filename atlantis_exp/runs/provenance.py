@@ -1,0 +1,25 @@
+"""What made a run: versions of code and libraries, and the command."""
+
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+_LIBRARIES = ("atlantis-exp", "ale-py", "gymnasium", "torch", "numpy", "opencv-python-headless", "hydra-core", "mlflow")
+
+
+def provenance(command: str) -> dict[str, str]:
+    """What made a run, as tags."""
+    tags = {f"version.{name}": version(name) for name in _LIBRARIES}
+    tags["version.python"] = sys.version.split()[0]
+    checkout = Path(__file__).resolve().parents[2]
+    if (checkout / ".git").exists():
+
+        def git(*arguments: str) -> str:
+            done = subprocess.run(("git", *arguments), cwd=checkout, capture_output=True, text=True, check=False)
+            return done.stdout.strip()
+
+        tags["git.commit"] = git("rev-parse", "HEAD")
+        tags["git.dirty"] = str(bool(git("status", "--porcelain", "--untracked-files=no"))).lower()
+    tags["command"] = command
+    return tags

@@ -1,0 +1,192 @@
+"""Exported weights: a folder with the network's weights, a card that says what they are, and a page for people."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import safetensors.numpy
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+from rich.table import Table
+
+from atlantis_exp.build import build_network_actor
+from atlantis_exp.checking import nearest, parse, to_dict
+from atlantis_exp.config import STRICT, Config, EvaluationConfig, PathsConfig
+from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.statistics import interval, resample, summarize
+from atlantis_exp.training.actor import Actor
+from atlantis_exp.training.evaluation import Evaluation
+
+MOST_BYTES = 8_000_000  # of the weights, since they lie in a repository
+
+_COLUMNS = ("mean", "95 % interval", "median", "IQM", "high", "low", "episodes", "epsilon", "seed")
+_RESAMPLES = 10_000  # bootstrap samples
+
+
+@dataclass(config=STRICT, kw_only=True, frozen=True)
+class Card:
+    """What is said of exported weights: which training they are of, and what they score."""
+
+    format: Literal[1]
+    run: str
+    weights: Literal["latest", "best"]
+    step: Annotated[int, Field(ge=0)]  # of the training
+    reached: dict[str, float]  # episodes, frames, updates and hours, at the last point of the curve until then
+    made: dict[str, str]  # command, commit and versions of the training's last session
+    precision: Literal["float32", "float16"]
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]  # of weights.safetensors
+    config: Config
+    evaluation: EvaluationConfig  # that gave the scores
+    scores: Annotated[list[float], Field(min_length=1)]  # an episode
+
+
+def read_card(folder: Path) -> tuple[Card, bytes]:
+    """A folder's card, and its weights as safetensors.
+
+    Raises:
+        ConfigError: without such a folder, or with a card that is none.
+        Fault: where the weights are not the card's.
+    """
+    path = folder / "card.json"
+    if not path.is_file():
+        others = {str(card.parent) for card in folder.parent.glob("*/card.json")}
+        raise ConfigError(
+            f"weights={folder}: no folder with a card.json; {nearest(str(folder), {'latest', 'best'} | others)}"
+        )
+    try:
+        tree = json.loads(path.read_bytes())
+        if not isinstance(tree, dict):
+            raise ConfigError("should be an object")
+        card = parse(Card, tree)
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    weights = (folder / "weights.safetensors").read_bytes()
+    if hashlib.sha256(weights).hexdigest() != card.sha256:
+        raise Fault(f"{folder / 'weights.safetensors'} does not have the checksum of its card")
+    return card, weights
+
+
+def write_card(folder: Path, card: Card, weights: bytes, evaluation: Evaluation) -> None:
+    """Fill a folder with the weights, their card, and the page that says the same to people."""
+    (folder / "weights.safetensors").write_bytes(weights)
+    (folder / "README.md").write_text(_page(folder, card, len(weights), evaluation))
+    (folder / "card.json").write_text(json.dumps(to_dict(card), indent=2) + "\n")
+
+
+def pack(weights: bytes) -> tuple[bytes, Literal["float32", "float16"]]:
+    """Weights as safetensors of at most `MOST_BYTES`, in half precision where they have to be.
+
+    Raises:
+        Fault: where that is too large, too.
+    """
+    if len(weights) <= MOST_BYTES:
+        return weights, "float32"
+    arrays = safetensors.numpy.load(weights)
+    half = {name: array.astype(np.float16) if array.dtype == np.float32 else array for name, array in arrays.items()}
+    packed = safetensors.numpy.save(half)
+    if len(packed) > MOST_BYTES:
+        raise Fault(f"the weights take {len(packed):,} bytes in half precision; an export has {MOST_BYTES:,} at most")
+    return packed, "float16"
+
+
+def portable(config: Config) -> Config:
+    """A config without what is its machine's alone: processes, devices, places and servers."""
+    return replace(
+        config,
+        resume="auto",
+        device="auto",
+        threads=None,
+        compile=False,
+        env=replace(config.env, workers=None),
+        tracking=replace(config.tracking, uri=None),
+        paths=PathsConfig(outputs="outputs"),
+    )
+
+
+def build_exported_actor(config: Config, weights: bytes, device: str) -> Actor:
+    """The player of exported weights; in float32 and on one thread, since rounding depends on how a batch is cut.
+
+    Raises: Fault.
+    """
+    exact = replace(config, threads=1, training=replace(config.training, precision="fp32"))
+    return build_network_actor(exact, weights, device)
+
+
+def side_by_side(card: Card, settings: EvaluationConfig, scores: Sequence[float]) -> Table:
+    """The card's scores, and those that were played with these settings."""
+    table = Table("", *_COLUMNS)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    table.add_row("card", *_points(card.evaluation, card.scores))
+    table.add_row("here", *_points(settings, scores))
+    return table
+
+
+def _points(settings: EvaluationConfig, scores: Sequence[float]) -> Iterator[str]:
+    """What `_COLUMNS` name; the interval is of the mean, over episodes."""
+    summary = summarize(scores)
+    samples = resample([np.array(scores)], _RESAMPLES, np.random.default_rng(0))
+    low, high = interval([float(sample.mean()) for sample in samples])
+    yield f"{summary.mean:,.0f}"
+    yield f"{low:,.0f} to {high:,.0f}"
+    yield from (f"{point:,.0f}" for point in (summary.median, summary.interquartile_mean, summary.high, summary.low))
+    yield from (str(setting) for setting in (summary.episodes, settings.epsilon, settings.seed))
+
+
+def _page(folder: Path, card: Card, size: int, evaluation: Evaluation) -> str:
+    env = to_dict(card.config.env)
+    del env["num_envs"], env["workers"]
+    training = {
+        "run": card.run,
+        "weights": f"{card.weights}, of step {card.step:,}",
+        **{key: f"{value:,.2f}" if value % 1 else f"{value:,.0f}" for key, value in card.reached.items()},
+        "seed": card.config.seed,
+        **card.made,
+    }
+    place = folder if len(folder.parts) > 1 and not folder.is_absolute() else f"./{folder.name}"
+    return f"""# {folder.name}
+
+Weights of a network that plays Atari Atlantis: {card.config.model.name} with {card.config.objective.name}.
+
+    python -m atlantis_exp evaluate weights={place}               # plays the episodes below
+    python -m atlantis_exp evaluate weights={place} episodes=1    # a first look
+
+## Scores
+
+| {" | ".join(_COLUMNS)} |
+|{" ---: |" * len(_COLUMNS)}
+| {" | ".join(_points(card.evaluation, card.scores))} |
+
+Played with the weights of this folder, in float32. The interval is the bootstrap's 95 % of the mean over these
+episodes; it says nothing of trainings with other seeds. The network's policy: {evaluation.policy}.
+
+    {evaluation.report().replace(chr(10), chr(10) + "    ")}
+
+## Protocol
+
+{_table(env)}
+
+## Training
+
+{_table(training)}
+
+`card.json` has the whole config. Episodes, frames, updates and hours are those of the last point of the training's
+curve at or before the step.
+
+## File
+
+`weights.safetensors`: {size:,} bytes, {card.precision}, sha256 `{card.sha256}`.
+
+## Licence
+
+That of this repository (MIT). The weights were learned from the game as ale-py emulates it; its ROM, which comes with
+ale-py under its own terms, is no part of them.
+""".replace("    \n", "\n")
+
+
+def _table(facts: dict[str, object]) -> str:
+    return "\n".join(["| | |", "| --- | --- |", *(f"| {key} | `{value}` |" for key, value in facts.items())])

@@ -1,0 +1,181 @@
+"""Any player played, its report printed, and the evaluation kept as a run of its own."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from atlantis_exp.build import build_baseline, build_evaluator, build_network_actor, build_person
+from atlantis_exp.checking import digest, flatten, to_dict
+from atlantis_exp.config import BaselineAgentConfig, EnvConfig, EvaluationConfig, PathsConfig, TrackingConfig
+from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.media import run_colour, score_histogram
+from atlantis_exp.runs.folder import BEST_EPISODE, EVALUATION, EVALUATION_REPORT, Result, RunFolder, find_run
+from atlantis_exp.runs.provenance import provenance
+from atlantis_exp.sessions.cards import build_exported_actor, read_card, side_by_side
+from atlantis_exp.sessions.job import config_colour, labels
+from atlantis_exp.sessions.weights import stored_weights
+from atlantis_exp.sessions.window import Window
+from atlantis_exp.tracking.publishing import catch_up, publishing
+from atlantis_exp.training.actor import Actor
+from atlantis_exp.training.evaluation import Evaluation, Stopped
+from atlantis_exp.training.progress import Progress
+
+STORED = ("latest", "best")
+"""The weights that a stored run has; what else `weights` names is a folder of exported ones."""
+
+
+def evaluate(
+    *,
+    run: str,
+    weights: str,
+    device: str,
+    evaluation: EvaluationConfig,
+    tracking: TrackingConfig,
+    paths: PathsConfig,
+    asked: Collection[str],
+    command: str,
+) -> None:
+    """Play a network on its own environment, print the report's table, and record it among the runs.
+
+    An exported network plays by the protocol of its card, as far as no key in `asked` says otherwise.
+    """
+    outputs = Path(paths.outputs)
+    catch_up(outputs)
+    card = None
+    if weights in STORED:
+        folder = find_run(outputs, run)
+        name, title, trained, source = folder.name, folder.title, folder.trained_config, {"run": folder.name}
+        stored, step = stored_weights(folder, weights)
+        actor = build_network_actor(trained, stored, device)
+    else:
+        if "run" in asked:
+            raise ConfigError(f"run={run}: weights={weights} are of no run here; drop one of the two")
+        card, stored = read_card(Path(weights))
+        trained, step = card.config, card.step
+        name = title = Path(weights).resolve().name
+        source = {"weights": name, "sha256": card.sha256}
+        protocol: dict[str, Any] = {
+            key: getattr(card.evaluation, key)
+            # The environments, too: rounding depends on how many states a batch has, and a near tie on rounding.
+            for key in ("episodes", "epsilon", "seed", "num_envs")
+            if not set(asked) & {"evaluation", f"evaluation.{key}"}
+        }
+        evaluation = replace(evaluation, **protocol)
+        actor = build_exported_actor(trained, stored, device)
+    facts = {**source, "step": step, "evaluation": to_dict(evaluation), "env": to_dict(trained.env)}
+    recorded = RunFolder(outputs / "evaluations" / f"{name}-at-{step}-{digest(facts)[:6]}")
+    shown = labels(f"evaluation of {title} at {step} {digest(facts)[:6]}", config_colour(trained), "evaluation")
+    played = _play(f"{name} at step {step:,}", actor, trained.env, evaluation)
+    _record(recorded, facts, played, tracking, outputs, shown, command)
+    if card:
+        table = side_by_side(card, evaluation, [episode.score for episode in played[0].episodes])
+        Console(highlight=False, width=max(Console().width, 130)).print(table)
+
+
+def play_baseline(
+    *,
+    agent: BaselineAgentConfig,
+    env: EnvConfig,
+    evaluation: EvaluationConfig,
+    tracking: TrackingConfig,
+    paths: PathsConfig,
+    name: str,
+    title: str,
+    command: str,
+) -> None:
+    """Let a player without a network play, print the report's table, and record it all as the run `name`."""
+    outputs = Path(paths.outputs)
+    catch_up(outputs)
+    facts = {
+        "agent": to_dict(agent),
+        "env": to_dict(env),
+        "evaluation": to_dict(evaluation),
+        "tracking": to_dict(tracking),
+        "paths": to_dict(paths),
+    }
+    played = _play(f"{agent.name} player on {env.id}", build_baseline(agent), env, evaluation)
+    shown = labels(title, run_colour(agent.name), "baseline")
+    _record(RunFolder(outputs / "runs" / name), facts, played, tracking, outputs, shown, command)
+
+
+def play(
+    *,
+    player: str,
+    scale: int,
+    env: EnvConfig,
+    evaluation: EvaluationConfig,
+    tracking: TrackingConfig,
+    paths: PathsConfig,
+    command: str,
+) -> None:
+    """Let a person play, print the report's table, and record it all.
+
+    The game runs at its 60 frames a second; picture and keys follow its steps, as for the networks.
+    """
+    outputs = Path(paths.outputs)
+    catch_up(outputs)
+    low, high = (env.frameskip, env.frameskip + 1) if isinstance(env.frameskip, int) else env.frameskip
+    window = Window(60 / ((low + high - 1) / 2), scale)  # steps a second, on average
+    actor, emulators = build_person(env, window.choose)
+    try:
+        played = build_evaluator(env, evaluation)(
+            actor, evaluation.episodes, Progress(), lambda: window.closed, emulators
+        )
+    except Stopped:
+        raise Fault("the window was closed before the last episode ended; nothing is recorded") from None
+    finally:
+        window.close()
+    names = (f"human-{player}-{env.id.rsplit('/')[-1]}-{number}" for number in count(1))
+    folder = RunFolder(next(path for name in names if not (path := outputs / "runs" / name).exists()))
+    facts = {
+        "player": player,
+        "scale": scale,
+        "env": to_dict(env),
+        "evaluation": to_dict(evaluation),
+        "tracking": to_dict(tracking),
+        "paths": to_dict(paths),
+    }
+    shown = labels(folder.name, run_colour("human"), "human")
+    _record(folder, facts, played, tracking, outputs, shown, command)
+
+
+def _play(what: str, actor: Actor, env: EnvConfig, evaluation: EvaluationConfig) -> tuple[Evaluation, bytes | None]:
+    progress = Progress()
+    progress.say(f"{what}: {evaluation.episodes} episodes, epsilon {evaluation.epsilon}")
+    return build_evaluator(env, evaluation)(actor, evaluation.episodes, progress)
+
+
+def _record(
+    folder: RunFolder,
+    facts: Mapping[str, Any],
+    played: tuple[Evaluation, bytes | None],
+    tracking: TrackingConfig,
+    outputs: Path,
+    shown: Mapping[str, str],
+    command: str,
+) -> None:
+    """Print an evaluation as the report does, and keep it as a run of its own; `facts` are its params."""
+    evaluation, video = played
+    print(f"\n{evaluation.report()}\n")
+    with folder.held(), publishing(folder, tracking, outputs, shown) as journal:
+        folder.write_config(facts)
+        journal.params({key: str(value) for key, value in flatten(facts).items()})
+        journal.tags({**provenance(command), "policy": evaluation.policy})
+        journal.note(f"    {evaluation.report().replace(chr(10), chr(10) + '    ')}")
+        step = int(facts.get("step", 0))
+        journal.metrics(evaluation.metrics(), step)
+        for index, episode in enumerate(evaluation.episodes):
+            journal.metrics({"score/episode": episode.score, "score/length": episode.steps}, index)
+        scores = [episode.score for episode in evaluation.episodes]
+        journal.image("evaluation/histogram", score_histogram(scores, folder.name), step)
+        journal.artifact(EVALUATION, evaluation.table().to_csv().encode())
+        journal.artifact(EVALUATION_REPORT, evaluation.report().encode())
+        if video is not None:
+            journal.artifact(BEST_EPISODE, video)
+        journal.finish()
+        folder.write_result(Result("finished", step, {}, evaluation.metrics(), evaluation.report()))
+    print(f"recorded as {folder.name} in {folder.path}")

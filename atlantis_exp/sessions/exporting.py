@@ -1,0 +1,80 @@
+"""A stored run's network as a folder to hand on: played as it will be handed on, then written with its card."""
+
+import hashlib
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from atlantis_exp.build import build_evaluator
+from atlantis_exp.config import EvaluationConfig, PathsConfig
+from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.runs.folder import RunFolder, find_run
+from atlantis_exp.runs.journal import Metrics, Tags, read
+from atlantis_exp.sessions.cards import Card, build_exported_actor, pack, portable, write_card
+from atlantis_exp.sessions.weights import stored_weights
+from atlantis_exp.tracking.publishing import catch_up
+from atlantis_exp.training.progress import Progress
+
+
+def export(
+    *,
+    run: str,
+    weights: Literal["latest", "best"],
+    to: str | None,
+    device: str,
+    evaluation: EvaluationConfig,
+    paths: PathsConfig,
+) -> None:
+    """Play the network as it will be handed on, then write it with a card of how it was made and what it scored."""
+    outputs = Path(paths.outputs)
+    catch_up(outputs)
+    source = find_run(outputs, run)
+    folder = Path(to or f"pretrained/{source.name}")
+    trained = portable(source.trained_config)
+    stored, step = stored_weights(source, weights)
+    packed, precision = pack(stored)
+    reached, made = _history(source, step)
+    folder.mkdir(parents=True, exist_ok=True)  # before the episodes, lest there be no place for their scores
+    if any(folder.iterdir()):
+        raise ConfigError(f"to={folder}: is not empty; name another folder")
+    actor = build_exported_actor(trained, packed, device)
+    settings = replace(evaluation, video=False)
+    progress = Progress()
+    progress.say(f"{source.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
+    played, _ = build_evaluator(trained.env, settings)(actor, settings.episodes, progress)
+    card = Card(
+        format=1,
+        run=source.name,
+        weights=weights,
+        step=step,
+        reached=reached,
+        made=made,
+        precision=precision,
+        sha256=hashlib.sha256(packed).hexdigest(),
+        config=trained,
+        evaluation=settings,
+        scores=[episode.score for episode in played.episodes],
+    )
+    write_card(folder, card, packed, played)
+    print(f"\n{played.report()}\n\n{len(packed):,} bytes in {precision}, with card and scores, in {folder}")
+
+
+def _history(run: RunFolder, step: int) -> tuple[dict[str, float], dict[str, str]]:
+    """What a training had behind it at a step, and what made it. Raises: Fault, where its journal is damaged."""
+    reached: dict[str, float] = {}
+    tags: dict[str, str] = {}
+    try:
+        records = [record for _, record in read(run.path)]
+    except ValueError as error:
+        raise Fault(f"run {run.name}: {error}") from error
+    for record in records:
+        if isinstance(record, Tags):
+            tags |= record.values
+        elif isinstance(record, Metrics) and "throughput/frames" in record.values and record.step <= step:
+            counters = ("throughput/episodes", "throughput/frames", "learning/updates", "throughput/hours")
+            reached = {name.split("/")[1]: record.values[name] for name in counters}
+    made = {key: value for key, value in tags.items() if key == "command" or key.startswith(("git.", "version."))}
+    if "command" in made:  # without the places of this machine
+        made["command"] = re.sub(r" (paths|tracking)\.\S+", "", made["command"])
+    return reached, made

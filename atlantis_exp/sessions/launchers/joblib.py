@@ -1,0 +1,84 @@
+"""Jobs side by side on this machine, each in a process of its own: whatever ends it, the others go on."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
+
+from atlantis_exp.faults import Fault
+from atlantis_exp.runs.folder import OUTPUT, RunFolder
+from atlantis_exp.runs.journal import Journal
+from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.launchers import APART, JOB_OF, Launcher, committed_at_the_end
+from atlantis_exp.sessions.stopping import sweep_goes_on
+
+
+@contextmanager
+def jobs(
+    journal: Journal, folders: Sequence[RunFolder], close_page: Callable[[], None], launcher: Launcher
+) -> Iterator[None]:
+    """Share the cores among the workers that the block starts, and have all jobs commit at its end."""
+    from joblib.externals.loky.backend import resource_tracker as its_own
+
+    with _shared_cores(launcher, folders):
+        for tracker in (resource_tracker, its_own):
+            tracker.ensure_running()  # started later, it would lift the mask
+        # A worker that a signal ends would take all others along: they inherit the mask. The signals reach this
+        # process all the same, through its other threads.
+        with committed_at_the_end(journal, folders, close_page, is_masked=True):
+            yield
+
+
+@contextmanager
+def _shared_cores(launcher: Launcher, folders: Sequence[RunFolder]) -> Iterator[None]:
+    """Tell the workers their share of the cores, unless a person has."""
+    if "OMP_NUM_THREADS" in os.environ:
+        yield
+        return
+    from joblib import cpu_count, effective_n_jobs
+
+    at_once = min(effective_n_jobs(launcher.n_jobs), sum(folder.state != "done" for folder in folders))
+    share = str(max(cpu_count() // max(at_once, 1), 1))
+    os.environ |= {"OMP_NUM_THREADS": share, "MKL_NUM_THREADS": share}
+    try:
+        yield
+    finally:
+        del os.environ["OMP_NUM_THREADS"], os.environ["MKL_NUM_THREADS"]
+
+
+def train_apart(job: Job) -> None:
+    """Train in a process of its own. Raises: Fault where the run fails."""
+    config, folder = job.config, RunFolder.of(job.config)
+    if config.resume != "never" and folder.ended(config.budget.steps) is not None:
+        return
+    if not sweep_goes_on(folder, job.launcher)():
+        raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
+    folder.path.mkdir(parents=True, exist_ok=True)
+    with open(folder.path / OUTPUT, "a+") as output:
+        start = output.tell()
+        code = subprocess.run(
+            [sys.executable, "-m", "atlantis_exp", "train", *job.overrides],
+            env={**os.environ, JOB_OF: APART},
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+            check=False,
+        ).returncode
+        if folder.parent and not RunFolder(folder.parent).is_held:
+            os._exit(code)  # the process that this worker works for was killed: there is nobody to tell
+        output.seek(start)
+        said = output.read().splitlines()
+    if code == 0:
+        return
+    reason = (
+        f"killed by {signal.Signals(-code).name}"
+        if code < 0
+        else (said or ["it said nothing"])[-1].removeprefix("atlantis_exp: ")
+    )
+    if code < 0 or (code == 1 and folder.state != "failed"):  # it could not say so itself
+        with suppress(Fault), folder.held():
+            Journal(folder.path).status("KILLED" if code < 0 else "FAILED", reason)
+    raise Fault(f"run {folder.name}: {reason}; see {folder.path / OUTPUT}", exit_code=code if code > 0 else 128 - code)

@@ -1,0 +1,48 @@
+"""Jobs of Slurm's, as their sweep's process sees them and as they are themselves."""
+
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from atlantis_exp.faults import Fault
+from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.launchers import as_one_line
+
+_LOOK_SECONDS = 5.0  # between two questions to Slurm
+
+
+@contextmanager
+def all_awaited() -> Iterator[None]:
+    """Wait for the other jobs where one that was cancelled or killed ends the launcher's own waiting.
+
+    Whoever interrupts the waiting reads that the jobs go on.
+
+    Raises:
+        Fault: names that job, or says why Slurm took none.
+    """
+    from submitit import SlurmJob
+    from submitit.core.utils import UncompletedJobError
+
+    try:
+        yield
+    except UncompletedJobError as error:
+        watcher = SlurmJob.watcher  # of all jobs that this process has submitted, and of their array
+        jobs = watcher._registered - {job.partition("_")[0] for job in watcher._registered if "_" in job}
+        while jobs - watcher._finished:
+            time.sleep(_LOOK_SECONDS)
+            watcher.update()
+        lines = str(error).splitlines()  # behind the first two comes all that the job has printed
+        raise Fault(" ".join(lines[:2]) if type(error) is UncompletedJobError else lines[-1]) from error
+    except (KeyboardInterrupt, SystemExit) as left:
+        print("atlantis_exp: the jobs go on; python -m atlantis_exp sync publishes what they do", file=sys.stderr)
+        sys.exit(getattr(left, "code", 128 + signal.SIGINT))
+
+
+def train_as_job(job: Job) -> None:
+    """Train as a job of Slurm's, or of whatever else has started this process. Raises: Fault where the run fails."""
+    from atlantis_exp.sessions.training import train  # and torch, which the sweep does without
+
+    with as_one_line(job.config.run_name()):
+        train(job)

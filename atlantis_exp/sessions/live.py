@@ -1,0 +1,126 @@
+"""A sweep's runs while other processes train them: one table on a terminal, plain lines elsewhere."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import timedelta
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from atlantis_exp.runs.folder import RunFolder, State
+from atlantis_exp.runs.journal import Metrics, read, read_commit
+from atlantis_exp.sessions.job import Job
+
+_ORDER: tuple[State, ...] = ("running", "failed", "interrupted", "done", "missing")
+
+
+@dataclass
+class _Run:
+    """What a run's journal says as of its last commit, of which only what is new is read."""
+
+    title: str
+    folder: RunFolder
+    length: int  # of the plan, in its unit
+    unit: str
+    state: State = "missing"
+    values: dict[str, float] = field(default_factory=dict)  # the last ones of each metric
+    step: int = 0
+    _identity: str = ""
+    _offset: int = 0  # bytes of the journal that are read
+    _updated: int = 0  # ms since 1970
+
+    def look(self) -> None:
+        if self.state == "done":
+            return
+        self.state = self.folder.state
+        commit = read_commit(self.folder.path)
+        if commit is None:
+            return
+        if commit.identity != self._identity:
+            self._identity, self._offset = commit.identity, 0
+        for _, record in read(self.folder.path, self._offset, commit.offset):
+            if isinstance(record, Metrics):
+                self.values |= record.values
+                self.step = record.step
+        self._offset, self._updated = commit.offset, commit.updated
+
+    @property
+    def done(self) -> int:
+        """Of the plan, in its unit."""
+        return int(self.values.get("throughput/episodes", 0)) if self.unit == "episodes" else self.step
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """Title, state, how far it is, steps a second, time left, last score."""
+        if not self.step:
+            return self.title, self.state, "", "", "", ""
+        speed, score = self.values.get("throughput/steps_per_second"), self.values.get("score/episode")
+        return (
+            self.title,
+            self.state,
+            f"{self.done:,} of {self.length:,} {self.unit}",
+            f"{speed:,.0f}" if speed else "",
+            self._left(),
+            "" if score is None else f"{score:,.0f}",
+        )
+
+    def _left(self) -> str:
+        hours = self.values.get("throughput/hours", 0.0)
+        if self.state != "running" or not hours or not self.done:
+            return ""
+        since = time.time() - self._updated / 1000
+        return str(timedelta(seconds=int(max(hours * 3600 * (self.length - self.done) / self.done - since, 0))))
+
+
+class LiveTable:
+    """Shows what the folders of a sweep's runs say; `look` is to be called every `seconds`."""
+
+    def __init__(self, jobs: Sequence[Job], folders: Sequence[RunFolder], console: Console | None = None) -> None:
+        self._console = console or Console(highlight=False, soft_wrap=True)
+        self._runs = [_run(job, folder) for job, folder in zip(jobs, folders, strict=True)]
+        self._said: dict[str, tuple[str, ...]] = {}
+        self._live: Live | None = None
+        self.seconds = 1.0 if self._console.is_terminal else 30.0
+
+    def look(self) -> None:
+        """Read what is new, and show it."""
+        for run in self._runs:
+            run.look()
+        if self._console.is_terminal:
+            self._draw()
+        else:
+            self._say()
+
+    def close(self) -> None:
+        """End the table."""
+        if self._live is not None:
+            self._live.stop()
+
+    def _draw(self) -> None:
+        table = Table("run", "state", "as of its last commit", "steps/s", "left", "last score", box=None)
+        for run in sorted(self._runs, key=lambda run: _ORDER.index(run.state)):  # those that matter, if not all fit
+            table.add_row(*run.cells)
+        if self._live is None:
+            self._live = Live(console=self._console, auto_refresh=False, transient=True)
+            self._live.start()
+        self._live.update(table, refresh=True)
+
+    def _say(self) -> None:
+        for run in self._runs:
+            name, state, done, speed, left, score = cells = run.cells
+            if self._said.get(name, (name, "missing", "", "", "", "")) != cells:
+                self._said[name] = cells
+                parts = [done, speed and f"{speed} steps/s", left and f"left {left}", score and f"last score {score}"]
+                self._console.print(f"  {state:12}{name}  {'  '.join(filter(None, parts))}", markup=False)
+
+
+def _run(job: Job, folder: RunFolder) -> _Run:
+    config = job.config
+    lengths = [(phase.episodes, phase.steps) for phase in config.phase.values()]
+    unit = "episodes" if lengths[0][0] else "steps"
+    length = sum(episodes or steps or 0 for episodes, steps in lengths)
+    if unit == "steps" and config.budget.steps is not None:
+        length = min(length, config.budget.steps)
+    return _Run(job.title, folder, length, unit)

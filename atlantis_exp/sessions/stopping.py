@@ -1,0 +1,88 @@
+"""How a training is asked to stop: by a signal, by the end of its time, or because its sweep has ended."""
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from math import inf
+from types import FrameType
+from typing import Any, NoReturn
+
+from atlantis_exp.faults import Fault
+from atlantis_exp.runs.folder import RunFolder
+
+_LOOK_SECONDS = 1.0  # between two looks at whether the sweep goes on
+
+
+class StopRequest:
+    """Turns the first SIGINT, SIGTERM or SIGUSR2, or the end of the time, into a flag that the trainer looks at.
+
+    So does the end of the sweep that the run is a job of, as `sweep_goes_on` tells it. A second SIGINT ends the process
+    at once; what was committed stays. Under Slurm SIGTERM is a warning: the run is committed and goes on, since Slurm
+    itself requeues or kills it.
+    """
+
+    def __init__(self, seconds: float | None = None, sweep_goes_on: Callable[[], bool] = lambda: True) -> None:
+        self.signal: int | None = None
+        self._is_warned = False  # by Slurm
+        self._deadline = inf if seconds is None else time.monotonic() + seconds
+        self._sweep_goes_on = sweep_goes_on
+        self._sweep_has_ended = False
+        self._looked = 0.0  # time
+        self._before: dict[int, Any] = {}  # handlers
+
+    def __call__(self) -> bool:
+        now = time.monotonic()
+        if now - self._looked >= _LOOK_SECONDS:
+            self._looked = now
+            self._sweep_has_ended = self._sweep_has_ended or not self._sweep_goes_on()
+        return self.signal is not None or self._is_warned or self._sweep_has_ended or now >= self._deadline
+
+    def was_a_warning(self) -> bool:
+        """Whether the run is to go on once it is committed; forgets the warning."""
+        was_warned, self._is_warned = self._is_warned, False
+        return was_warned and self.signal is None
+
+    def end(self, message: str) -> NoReturn:
+        """End the process as the request wants it; raises Fault for the end of the time, so that a sweep goes on."""
+        if self.signal is None and self._sweep_has_ended:
+            raise Fault(f"the sweep has ended: {message}", exit_code=128 + signal.SIGTERM)
+        if self.signal is None:
+            raise Fault(f"budget.wall_clock: {message}", exit_code=124)  # as of timeout(1)
+        print(f"atlantis_exp: {signal.Signals(self.signal).name}: {message}", file=sys.stderr, flush=True)
+        if self.signal == signal.SIGUSR2 and callable(handler := self._before[signal.SIGUSR2]):
+            handler(self.signal, None)  # submitit's own requeues the job and exits
+        sys.exit(128 + self.signal)
+
+    @contextmanager
+    def installed(self) -> Iterator[None]:
+        """Listen while the block runs."""
+        signals = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
+        self._before = {number: signal.signal(number, self._receive) for number in signals}
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)  # as inherited from a launcher's worker
+        try:
+            yield
+        finally:
+            for number, handler in self._before.items():
+                signal.signal(number, handler)
+
+    def _receive(self, number: int, _: FrameType | None) -> None:
+        if self.signal is not None and number == signal.SIGINT:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+            signal.raise_signal(signal.SIGINT)
+        if number == signal.SIGTERM and "SLURM_JOB_ID" in os.environ:
+            self._is_warned = True  # apart, as a SIGUSR2 before it still means that the job is to be requeued
+        else:
+            self.signal = number
+
+
+def sweep_goes_on(folder: RunFolder, launcher: str | None) -> Callable[[], bool]:
+    """What tells whether the process that launched this job still wants it; Slurm's jobs do without that process."""
+    if folder.parent is None or launcher not in ("joblib", "apart", "ray"):
+        return lambda: True
+    sweep = RunFolder(folder.parent)
+    if launcher == "ray":  # whose machines may not see each other's locks
+        return lambda: sweep.status == "RUNNING"
+    return lambda: sweep.status == "RUNNING" and sweep.is_held

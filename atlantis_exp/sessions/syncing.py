@@ -1,0 +1,124 @@
+"""Run folders and an MLflow store, brought up to each other."""
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from atlantis_exp.config import PathsConfig, TrackingConfig
+from atlantis_exp.faults import Fault
+from atlantis_exp.runs.folder import RunFolder, all_folders
+from atlantis_exp.tracking.store import Store, brought, publish
+from atlantis_exp.tracking.travel import bring, is_here, place
+
+_CHANGES = ("brought", "published")
+
+
+class Look(NamedTuple):
+    """What became of one run, and why where that is no matter of course."""
+
+    outcome: str
+    run: str
+    reason: str = ""
+
+
+def sync(
+    *,
+    to: str | None,
+    from_: str | None,
+    every: str | int | None,
+    seconds: int | None,
+    tracking: TrackingConfig,
+    paths: PathsConfig,
+) -> None:
+    """Bring runs and store up to each other, once or until interrupted; print a line a run that changed, and counts.
+
+    Raises:
+        Fault: where the store cannot be reached or a run failed; with `every`, which is so many `seconds`, that is
+            said, and tried again.
+    """
+    outputs = Path(paths.outputs)
+    store = Store(outputs, tracking.experiment, to or tracking.uri)
+    source = Store(outputs, tracking.experiment, from_) if from_ else None
+    is_first = True
+    try:
+        while True:
+            try:
+                if source is not None:
+                    _tell(f"from {source.uri}", _bring_all(outputs, source), is_first)
+                _tell(f"to {store.uri}", _publish_all(outputs, store, only_brought=source is not None), is_first)
+            except Fault as fault:
+                if seconds is None:
+                    raise
+                print(f"atlantis_exp: {fault}; looking again in {every}", file=sys.stderr, flush=True)
+            if seconds is None:
+                return
+            is_first = False
+            time.sleep(seconds)
+    except KeyboardInterrupt:
+        sys.exit(130)  # 128 + SIGINT; whatever has arrived is noted
+
+
+def _tell(way: str, looks: Iterable[Look], is_first: bool) -> None:
+    """Print what became of runs; counts only at first and where something did. Raises: Fault."""
+    counts: Counter[str] = Counter()
+    for outcome, run, reason in looks:
+        counts[outcome] += 1
+        if reason:
+            print(f"atlantis_exp: {run}: {outcome}: {reason}", file=sys.stderr, flush=True)
+        elif outcome in _CHANGES:
+            print(f"  {outcome:12}{run}", flush=True)
+    if is_first or any(outcome in counts for outcome in (*_CHANGES, "failed")):
+        listed = ", ".join(f"{count} {outcome}" for outcome, count in sorted(counts.items()))
+        print(f"{way}: {counts.total()} runs{': ' if listed else ''}{listed}", flush=True)
+    if counts["failed"]:
+        raise Fault(f"{way}: {counts['failed']} of {counts.total()} runs failed")
+
+
+def _publish_all(outputs: Path, store: Store, only_brought: bool) -> Iterator[Look]:
+    for folder in (each.path for each in reversed(all_folders(outputs))):  # sweeps before runs, which publish theirs
+        run = str(folder.relative_to(outputs))
+        try:
+            if only_brought and brought(folder) is None:
+                continue
+            yield Look("published" if publish(folder, store, is_primary=False) else "up to date", run)
+        except Exception as error:
+            yield Look("failed", run, _reason(error, store))
+
+
+def _bring_all(outputs: Path, source: Store) -> Iterator[Look]:
+    try:
+        runs = sorted(source.runs(), key=lambda run: run.folder.parts[-2:], reverse=True)
+    except Exception as error:
+        raise Fault(f"{source.uri} cannot be reached: {_first_line(error)}") from None
+    listed = {run.run_id for run in runs}
+    for run in runs:
+        try:
+            folder = place(run, outputs)
+            if is_here(folder, run):
+                yield Look("as here", run.name)
+                continue
+            with RunFolder(folder).held():
+                outcome = bring(run, folder, source, listed)
+            reason = f"{folder} is another run, which stays" if outcome == "other" else ""
+            yield Look(outcome, str(folder.relative_to(outputs)), reason)
+        except Fault as fault:
+            yield Look("held", run.name, str(fault))
+        except Exception as error:
+            yield Look("failed", run.name, _reason(error, source))
+
+
+def _reason(error: Exception, store: Store) -> str:
+    """What went wrong with one run. Raises: Fault where it is the store that did."""
+    if not isinstance(error, ValueError):  # which is what a run's own files raise
+        try:
+            store.client.get_experiment(store.experiment_id)
+        except Exception as fault:
+            raise Fault(f"{store.uri} cannot be reached: {_first_line(fault)}") from None
+    return _first_line(error)
+
+
+def _first_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}".partition("\n")[0]

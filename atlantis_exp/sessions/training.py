@@ -1,0 +1,171 @@
+"""A training as a session: opened, run, closed; the same job again continues it, or reports how it has ended."""
+
+import dataclasses
+import signal
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from functools import partial
+
+import torch
+
+from atlantis_exp.build import build_trainer
+from atlantis_exp.checking import flatten, to_dict
+from atlantis_exp.config import Config
+from atlantis_exp.faults import ConfigError, Fault, RunFault
+from atlantis_exp.runs.folder import CONFIG, TRACEBACK, Result, RunFolder
+from atlantis_exp.runs.journal import Journal, adopt
+from atlantis_exp.runs.provenance import provenance
+from atlantis_exp.sessions.job import Job, labels
+from atlantis_exp.sessions.stopping import StopRequest, sweep_goes_on
+from atlantis_exp.tracking.publishing import catch_up, publishing
+from atlantis_exp.training.forecast import forecast
+from atlantis_exp.training.progress import Progress
+from atlantis_exp.training.trainer import Outcome, Trainer
+
+
+def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> None:
+    """Start the run that a job is, continue it, or print its result if it has ended.
+
+    As a job of a sweep that another process runs, it writes the run's folder only: that process publishes it.
+
+    watch: asked after every step; where it says so, the run is committed and left to be continued.
+    """
+    config, folder = job.config, RunFolder.of(job.config)
+    if _has_ended(job, folder):
+        return
+    progress = Progress()
+    stop = StopRequest(config.budget.seconds, sweep_goes_on(folder, job.launcher))
+    tracking = config.tracking if job.launcher is None else dataclasses.replace(config.tracking, name="none")
+    shown = {**labels(job.title, job.colour, "training"), "group": job.group}
+    about = f"Network `{config.model.name}` on {config.env.id}, seed {config.seed}. Continue or report: `{job.command}`"
+    with folder.held(), stop.installed(), publishing(folder, tracking, job.outputs, shown) as journal:
+        with _faults_recorded(job, folder, journal), closing(progress):
+            trainer = build_trainer(config, folder.path, journal, progress, about)
+            with trainer.emulators:
+                _open(trainer, job, folder, journal, progress)
+                watched = partial(watch, trainer)
+                outcome = trainer.run(lambda: stop() or watched())
+                while outcome == "interrupted" and stop.was_a_warning():
+                    at = f"{trainer.counters.steps:,}"
+                    progress.say(f"SIGTERM: committed at step {at}, going on until Slurm ends it")
+                    outcome = trainer.run(lambda: stop() or watched())
+        result = _close(trainer, folder, journal, outcome)
+    steps = f"{trainer.counters.steps:,}"
+    if outcome != "interrupted":
+        print(f"\n{result.report}\n\nrun {folder.name}: {steps} steps, {trainer.counters.seconds:,.0f} s")
+    elif stop():
+        stop.end(f"run {folder.name} is committed at step {steps}; continue with: {job.command}")
+
+
+def _has_ended(job: Job, folder: RunFolder) -> bool:
+    """Whether there is nothing to train, which is then said; puts a run aside that is to be started over."""
+    config = job.config
+    if job.launcher is None:
+        catch_up(job.outputs, folder.path if folder.result is None else None)
+    if not sweep_goes_on(folder, job.launcher)():
+        raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
+    if config.resume == "must" and not folder.has_started:
+        raise ConfigError(f"resume=must: there is no run {folder.name} under {job.outputs / 'runs'}")
+    parent = folder.parent
+    if config.resume == "never" and folder.has_started:
+        kept = next(
+            path for n in range(1, 10_000) if not (path := folder.path.with_name(f"{folder.name}~{n}")).exists()
+        )
+        with folder.held():
+            folder.path.rename(kept)
+        if parent is not None:
+            adopt(folder.path, parent)
+        print(f"the run that was here is kept as {kept}")
+    if (result := folder.ended(config.budget.steps)) is None:
+        return False
+    print(f"run {folder.name} has ended ({result.outcome} after {result.steps:,} steps):\n")
+    print(result.report)
+    return True
+
+
+def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progress: Progress) -> None:
+    """Bring a trainer to its run's last commit, and write down what the run is."""
+    config = job.config
+    state = trainer.checkpoints.load(trainer.memory, progress.say)
+    folder.write_config(to_dict(config))
+    steps_done = 0 if state is None else state["counters"]["steps"]
+    if state is None:
+        progress.say(f"starting run {folder.name} in {folder.path}")
+    else:
+        progress.say(f"continuing run {folder.name} at step {steps_done:,}")
+    if config.budget.forecast != "off":
+        # Before there is anything to publish: MLflow's import at the same time took three quarters of the speed.
+        _check_forecast(trainer, config, steps_done, progress)
+    if state is None:
+        env = config.env
+        flops = trainer.learner.update_flops((env.stack, env.size, env.size), config.training.batch_size)
+        journal.params({key: str(value) for key, value in flatten(to_dict(config)).items()})
+        journal.artifact(CONFIG, (folder.path / CONFIG).read_bytes())
+        journal.tags({"flops_per_update": str(flops)})
+    else:
+        trainer.load_state_dict(state)
+    facts = {
+        "device": str(trainer.learner.device),
+        "precision": str(trainer.learner.dtype).removeprefix("torch."),
+        "threads": str(trainer.learner.shards * torch.get_num_threads()),
+    }
+    journal.tags({**provenance(job.command), **facts})
+    journal.status("RUNNING")
+
+
+def _check_forecast(trainer: Trainer, config: Config, steps_done: int, progress: Progress) -> None:
+    expected = forecast(
+        trainer,
+        capacity=config.replay.capacity,
+        max_bytes=config.replay.max_bytes,
+        size=config.env.size,
+        stack=config.env.stack,
+        steps_done=steps_done,
+        evaluations_an_episode=1 / (config.evaluation.every_episodes or float("inf")),
+    )
+    progress.say(str(expected))
+    if expected.shortage is not None:
+        if config.budget.forecast == "refuse":
+            raise Fault(f"{expected.shortage}; budget.forecast=warn starts all the same")
+        progress.say(f"warning: {expected.shortage}")
+
+
+@contextmanager
+def _faults_recorded(job: Job, folder: RunFolder, journal: Journal) -> Iterator[None]:
+    """Write down why the block failed; a fault also says how to continue."""
+    try:
+        yield
+    except BaseException as error:
+        with suppress(OSError):  # a full disk takes no status either; the next command sees that nobody holds it
+            (folder.path / TRACEBACK).write_text(traceback.format_exc())
+            journal.status("FAILED", str(error) or type(error).__name__)
+        if isinstance(error, RunFault | OSError):
+            raise Fault(f"run {folder.name}: {error}; continue with: {job.command}") from error
+        if job.config.compile and _is_of_compilation(error):
+            reason = str(error).strip().partition("\n")[0]
+            raise Fault(f"run {folder.name}: torch.compile failed, {reason}; compile=false does without") from error
+        raise
+
+
+def _close(trainer: Trainer, folder: RunFolder, journal: Journal, outcome: Outcome) -> Result:
+    """Say how the session has ended and, where the run has, keep its result."""
+    counters, recorder = trainer.counters, trainer.recorder
+    counts = {
+        "episodes": counters.episodes,
+        "frames": counters.frames,
+        "updates": trainer.learner.updates,
+        "hours": counters.seconds / 3600,
+    }
+    report = recorder.last_report or "no evaluation (evaluation.at_end=false)"
+    result = Result(outcome, counters.steps, counts, recorder.last_metrics, report)
+    journal.status("KILLED" if outcome == "interrupted" else "FINISHED")
+    if outcome != "interrupted":  # while it is still published: a server is sent the result, too
+        folder.write_result(result)
+    return result
+
+
+def _is_of_compilation(error: BaseException) -> bool:
+    from torch._dynamo.exc import TorchDynamoException  # takes a second to import
+
+    return isinstance(error, TorchDynamoException)

@@ -1,0 +1,97 @@
+"""Is a training that is killed again and again the unbroken one?"""
+
+import json
+import random
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from atlantis_exp.build import build_memory
+from atlantis_exp.checking import flatten, to_dict
+from atlantis_exp.config import Config
+from atlantis_exp.faults import Fault
+from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.runs.provenance import provenance
+from atlantis_exp.sessions.job import Job, command_line, labels
+from atlantis_exp.tracking.publishing import publishing
+from atlantis_exp.training.checkpoint import Checkpoints
+from atlantis_exp.training.fingerprint import fingerprint
+
+_KILLS = 3
+
+
+def verify_resume(job: Job) -> None:
+    """Train once unbroken and once with SIGKILLs at random moments, compare, and record the verdict as a run."""
+    config, outputs = job.config, job.outputs
+    folder = RunFolder(outputs / "verifications" / config.run_name())
+    overrides = [*job.overrides, "tracking=none"]
+    with folder.held():
+        for name in ("unbroken", "killed"):
+            shutil.rmtree(folder.path / name, ignore_errors=True)
+        print(f"training {config.run_name()} unbroken", flush=True)
+        train_and_kill(config, overrides, folder.path / "unbroken", 0)
+        print(f"training it again, killed {_KILLS} times", flush=True)
+        kills = train_and_kill(config, overrides, folder.path / "killed", _KILLS)
+        unbroken, killed = fingerprints(config, folder.path / "unbroken"), fingerprints(config, folder.path / "killed")
+        differing = sorted(part for part in unbroken if unbroken[part] != killed[part])
+        verdict = f"differs in {', '.join(differing)}" if differing else "is the unbroken one, bit for bit"
+        shown = labels(f"verify-resume {job.title}", job.colour, "verification")
+        with publishing(folder, config.tracking, outputs, shown) as journal:
+            journal.params({key: str(value) for key, value in flatten(to_dict(config)).items()})
+            journal.tags({**provenance(command_line("verify-resume", *job.overrides)), "verdict": verdict})
+            journal.note(f"A training that was killed {kills} times {verdict}.")
+            journal.metrics({"verification/equal": not differing, "verification/kills": kills}, 0)
+            hashes = json.dumps({"unbroken": unbroken, "killed": killed}, indent=2)
+            journal.artifact("fingerprints.json", hashes.encode())
+            journal.flush()
+            journal.status("FAILED" if differing else "FINISHED")
+    for part, value in unbroken.items():
+        print(f"{part:16}{value[:16]}  {killed[part][:16]}{'  DIFFERENT' if part in differing else ''}")
+    print(f"\nthe training killed {kills} times {verdict}")
+    if differing:
+        raise Fault(f"resuming is not exact: see {folder.path}")
+
+
+def train_and_kill(config: Config, overrides: Sequence[str], outputs: Path, kills: int) -> int:
+    """Train under `outputs`, with a SIGKILL at a random moment after a commit, `kills` times; returns how many struck.
+
+    Raises:
+        Fault: a session ended with an error.
+    """
+    # When commits happen changes nothing, and without one there is nothing to continue from.
+    own = (f"paths.outputs={outputs}", "tracking.commit_seconds=1.0", "resume=auto")
+    command = (sys.executable, "-m", "atlantis_exp", "train", *overrides, *own)
+    folder = outputs / "runs" / config.run_name()
+    struck = 0
+    while True:
+        before = _generation(folder)
+        session = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        while struck < kills and session.poll() is None:
+            time.sleep(0.01)
+            if _generation(folder) > before:
+                time.sleep(random.random())
+                session.kill()
+                struck += session.wait() == -9
+                break
+        else:
+            error = session.communicate()[1]
+            if session.returncode:
+                raise Fault(f"a session under {outputs} failed: {error.strip().splitlines()[-1]}")
+            return struck
+
+
+def fingerprints(config: Config, outputs: Path) -> dict[str, str]:
+    """The hashes of a training that has ended under `outputs`. Raises: Fault."""
+    memory = build_memory(config)
+    folder = RunFolder(outputs / "runs" / config.run_name())
+    state = Checkpoints(folder.checkpoints, config.identity()).load(memory)
+    if state is None:
+        raise Fault(f"there is no checkpoint in {folder.path}")
+    return fingerprint(state, memory, folder.path)
+
+
+def _generation(folder: Path) -> int:
+    return max((int(path.parent.name) for path in folder.glob("checkpoints/0*/manifest.json")), default=0)

@@ -1,0 +1,51 @@
+"""A window in which a person plays."""
+
+from typing import TYPE_CHECKING
+
+from atlantis_exp.faults import Fault
+
+if TYPE_CHECKING:
+    from atlantis_exp.game.preprocessing import Pixels
+
+
+class Window:
+    """A pygame window that shows screens at the game's speed and says which action the keys mean.
+
+    Raises:
+        Fault: where pygame is not installed or there is no screen.
+    """
+
+    def __init__(self, steps_per_second: float, scale: int) -> None:
+        try:
+            import pygame
+        except ImportError:
+            raise Fault("play needs pygame: pip install 'atlantis-exp[play]'") from None
+        self._pygame = pygame
+        try:
+            pygame.display.init()
+            self._surface = pygame.display.set_mode((160 * scale, 210 * scale))
+        except pygame.error as error:
+            raise Fault(f"play needs a screen: {error}") from None
+        pygame.display.set_caption("Atlantis: left, up, right fire a gun each; a gun fires once a press")
+        # In the order of precedence: ALE's actions 3 LEFTFIRE, 2 RIGHTFIRE, 1 FIRE, which is the gun in the middle.
+        self._actions = {pygame.K_LEFT: 3, pygame.K_RIGHT: 2, pygame.K_UP: 1, pygame.K_SPACE: 1}
+        self._clock = pygame.time.Clock()
+        self._steps_per_second = steps_per_second
+        self.closed = False
+
+    def choose(self, screen: "Pixels") -> int:
+        """Show a screen, (210, 160, 3) uint8, for one step; the action of the keys pressed meanwhile or still."""
+        pygame = self._pygame
+        picture = pygame.surfarray.make_surface(screen.swapaxes(0, 1))
+        self._surface.blit(pygame.transform.scale(picture, self._surface.get_size()), (0, 0))
+        pygame.display.flip()
+        self._clock.tick(self._steps_per_second)
+        events = pygame.event.get()
+        self.closed = self.closed or any(event.type == pygame.QUIT for event in events)
+        tapped = {event.key for event in events if event.type == pygame.KEYDOWN}
+        held = pygame.key.get_pressed()
+        return next((action for key, action in self._actions.items() if key in tapped or held[key]), 0)
+
+    def close(self) -> None:
+        """Close the window."""
+        self._pygame.display.quit()

@@ -1,0 +1,69 @@
+"""Run folders and the store while a command works: mirrored as they grow, and what earlier commands left is sent."""
+
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from atlantis_exp.config import TrackingConfig
+from atlantis_exp.faults import Fault
+from atlantis_exp.runs.folder import RunFolder, all_folders
+from atlantis_exp.runs.journal import Journal
+from atlantis_exp.tracking.store import Publisher, Store, brought, unfinished
+
+_DRAIN_SECONDS = 20.0  # that a command waits for MLflow at its end; `catch_up` sends what is missing then
+
+
+@contextmanager
+def publishing(
+    folder: RunFolder,
+    tracking: TrackingConfig,
+    outputs: Path,
+    labels: Mapping[str, str],
+    others: Sequence[RunFolder] = (),
+) -> Iterator[Journal]:
+    """A journal in the run's folder that is mirrored to MLflow while it grows (tracking=mlflow).
+
+    labels: tags that the run bears from its first moment.
+    others: runs that other processes write and that are mirrored too.
+
+    Raises:
+        JournalError: where the folder's journal is damaged.
+    """
+    journal = Journal(folder.path, labels)
+    if tracking.name == "none":
+        yield journal
+        return
+    store = Store(outputs, tracking.experiment, tracking.uri)
+    publisher = Publisher(folder.path, store, others=[other.path for other in others])
+    try:
+        yield journal
+    finally:
+        if not publisher.drain(_DRAIN_SECONDS):
+            print(
+                f"atlantis_exp: MLflow has not taken all of {folder.name} yet; the run's folder has it", file=sys.stderr
+            )
+
+
+def catch_up(outputs: Path, continued: Path | None = None) -> None:
+    """Mark runs whose process died as interrupted; publish what earlier commands could not.
+
+    Not published is the run in the folder `continued`, whose own session will do so.
+    """
+    unreachable: set[str] = set()
+    for folder in all_folders(outputs):
+        try:
+            runs_here = folder.status == "RUNNING" and not brought(folder.path)
+            if runs_here and not folder.is_held:
+                with suppress(Fault), folder.held():
+                    Journal(folder.path).status("KILLED")
+                    print(f"run {folder.name} was killed; the command that started it continues it")
+            is_sent = folder.status == "RUNNING" or folder.path == continued
+            store = None if is_sent else unfinished(folder.path, outputs)
+        except Fault as fault:
+            print(f"atlantis_exp: {fault}", file=sys.stderr)  # no reason to refuse a command for another run
+            continue
+        if store is None or store.address in unreachable:
+            continue
+        if not Publisher(folder.path, store).drain(_DRAIN_SECONDS):
+            unreachable.add(store.address)

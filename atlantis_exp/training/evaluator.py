@@ -1,0 +1,56 @@
+"""An evaluation protocol with all that it needs: emulators of its own, episodes, epsilon, film."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from atlantis_exp.game.emulator import Emulator
+from atlantis_exp.game.vector import Emulators
+from atlantis_exp.training.actor import Actor
+from atlantis_exp.training.evaluation import Evaluation, evaluate
+from atlantis_exp.training.film import film_episode
+from atlantis_exp.training.progress import Progress
+
+
+@dataclass(frozen=True)
+class Evaluator:
+    """Evaluates any actor by one protocol, without touching a training that is under way."""
+
+    make_emulators: Callable[[int], Emulators]
+    make_emulator: Callable[[], Emulator]
+    epsilon: float
+    seed: int
+    num_envs: int  # episodes played side by side
+    size: int  # pixels
+    stack: int  # observations
+    video: bool  # of the best episode
+
+    def __call__(
+        self,
+        actor: Actor,
+        episodes: int,
+        progress: Progress,
+        stop: Callable[[], bool] = lambda: False,
+        emulators: Emulators | None = None,
+    ) -> tuple[Evaluation, bytes | None]:
+        """Play so many episodes; with the film of the best one where there is to be one.
+
+        emulators: those to play on; None: new ones.
+
+        Raises:
+            Stopped: when `stop` says so.
+        """
+        with emulators or self.make_emulators(min(self.num_envs, episodes)) as emulators:
+            result = evaluate(
+                actor,
+                emulators,
+                episodes=episodes,
+                epsilon=self.epsilon,
+                seed=self.seed,
+                size=self.size,
+                stack=self.stack,
+                on_step=progress.evaluating,
+                stop=stop,
+            )
+        if not self.video:
+            return result, None
+        return result, film_episode(result.best, actor, self.make_emulator(), self.stack)

@@ -1,0 +1,97 @@
+"""What is trained when, and how often it is written down."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from atlantis_exp.learning.schedules import Schedule
+from atlantis_exp.replay.memory import Returns
+from atlantis_exp.replay.samplers import Sampler
+
+Unit = Literal["episodes", "steps"]
+
+
+@dataclass
+class Counters:
+    """What was done so far, over all sessions."""
+
+    steps: int = 0
+    frames: int = 0
+    episodes: int = 0
+    random: int = 0  # decisions that chance took
+    learn_ticks: int = 0  # multiples of learn_every that have passed
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of training with its own learning rate and sampler."""
+
+    name: str
+    length: int  # in the plan's unit
+    learning_rate: float
+    sampler: Sampler
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is trained when: phases one after the other, all measured in episodes or all in steps."""
+
+    unit: Unit
+    phases: Sequence[Phase]
+    epsilon: Schedule
+    learning_rate: Schedule  # share of the phase's
+    returns: Returns
+    terminal_on_life_loss: bool  # for what is learned; the episode goes on
+    learn_every: int  # steps
+    learn_start: int  # transitions in the memory
+    batch_size: int  # transitions
+
+    @property
+    def length(self) -> int:
+        """Of all phases together, in the plan's unit."""
+        return sum(phase.length for phase in self.phases)
+
+    def done(self, counters: Counters) -> int:
+        """How much of `length` is done."""
+        return counters.episodes if self.unit == "episodes" else counters.steps
+
+    def phase_at(self, counters: Counters) -> Phase:
+        """The phase under way; the last one keeps what comes after it."""
+        done = self.done(counters)
+        for phase in self.phases:
+            done -= phase.length
+            if done < 0:
+                return phase
+        return self.phases[-1]
+
+    def learning_rate_at(self, counters: Counters) -> float:
+        """The step size of the next update."""
+        share = self.learning_rate(self.done(counters) / self.length, counters.steps)
+        return self.phase_at(counters).learning_rate * share
+
+    def epsilon_at(self, counters: Counters) -> float:
+        """The probability that chance takes the next decision."""
+        # The report counts the episode under way as one: its first has epsilon(1), not epsilon(0).
+        running = 1 if self.unit == "episodes" else 0
+        return self.epsilon((self.done(counters) + running) / self.length, counters.steps)
+
+
+@dataclass(frozen=True)
+class Cadence:
+    """How often things are written down, all of it without influence on what is learned."""
+
+    curve_steps: int  # steps between two points of a curve
+    histogram_episodes: int  # episodes in a window's histogram
+    commit_episodes: int  # episodes between two commits
+    commit_seconds: float  # seconds between two commits at the most
+    evaluate_episodes: int | None  # training episodes between two evaluations
+    evaluate_steps: int | None  # training steps between two evaluations
+    evaluate_at_end: bool
+    interim_episodes: int  # of an evaluation amid the training
+    final_episodes: int  # of the one at its end
+
+
+def passed(every: int | None, before: int, now: int) -> bool:
+    """Whether a multiple of `every` lies in (before, now]; never where there is none."""
+    return every is not None and now // every > before // every

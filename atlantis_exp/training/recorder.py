@@ -1,0 +1,256 @@
+"""What a training writes down: its episodes, curves, pictures, evaluations and description.
+
+Nothing of it is learned from. A metric of the training is added in `Recorder.curves`, one of an evaluation in
+`Evaluation.metrics`.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import safetensors.torch
+
+from atlantis_exp.faults import RunFault
+from atlantis_exp.learning.learner import Learner
+from atlantis_exp.media import score_heatmap, score_histogram
+from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.runs.folder import BEST_EPISODE, BEST_WEIGHTS, EPISODES, evaluation_at
+from atlantis_exp.runs.journal import Tracker
+from atlantis_exp.statistics import TABLE_COLUMNS
+from atlantis_exp.training.evaluation import Evaluation, Stopped
+from atlantis_exp.training.plan import Cadence, Counters, Plan
+from atlantis_exp.training.progress import Pace, Progress, Snapshot
+
+Stop = Callable[[], bool]
+Evaluate = Callable[[int, Progress, Stop], tuple[Evaluation, bytes | None]]
+"""Plays so many episodes; with a film of the best one, if there is to be one. Raises: Stopped."""
+
+
+class Played(NamedTuple):
+    """An episode of the training, and how far the training was at its end."""
+
+    episode: int  # counted from 1
+    step: int
+    frames: int
+    score: float
+    length: int  # steps
+    env: int
+
+
+class Diverged(RunFault):
+    """The loss was no finite number; the last commit is from before."""
+
+
+class Recorder:
+    """Tells a tracker and a person how a training goes; has a state of its own, and changes nobody else's.
+
+    about: markdown that opens the run's description: what it is and how to continue it.
+    """
+
+    def __init__(
+        self,
+        *,
+        plan: Plan,
+        cadence: Cadence,
+        learner: Learner,
+        memory: ReplayMemory,
+        tracker: Tracker,
+        progress: Progress,
+        evaluate: Evaluate,
+        about: str = "",
+    ) -> None:
+        self.plan, self.cadence, self.learner, self.memory = plan, cadence, learner, memory
+        self.tracker, self.progress, self._evaluate = tracker, progress, evaluate
+        self.about = about
+        self.episodes: list[Played] = []
+        self.best_mean = -np.inf  # of all evaluations
+        self.best_step = -1
+        self.evaluations = 0
+        self.evaluated_at = -1  # steps
+        self.evaluation_pending = False  # of this very step: it was asked to stop; redone on resume
+        self.last_report = ""  # of the latest evaluation
+        self.last_metrics: dict[str, float] = {}  # of the latest evaluation
+        self._pace = Pace()
+        self._max_steps: int | None = None
+
+    def begin(self, counters: Counters, max_steps: int | None) -> None:
+        """To be called once a session, before its first step."""
+        self._pace = Pace()
+        self._pace.tick(counters.steps)
+        self._max_steps = max_steps
+        self._describe("running", counters)
+
+    def end(self, counters: Counters, outcome: str) -> None:
+        """To be called once a session, before its last commit."""
+        self._write_episodes()
+        self._describe(outcome, counters)
+
+    def episode(self, played: Played) -> None:
+        """Write down an episode, and the pictures of those before it once their window is full."""
+        self.episodes.append(played)
+        self.tracker.metrics({"score/episode": played.score, "score/length": played.length}, played.step)
+        if played.episode % self.cadence.histogram_episodes == 0:
+            window = self.recent_scores(self.cadence.histogram_episodes)
+            title = f"training, episodes {played.episode - len(window) + 1}-{played.episode}"
+            # A slider that counts windows, not steps: at each of its positions every run has a picture.
+            number = played.episode // self.cadence.histogram_episodes - 1
+            self.tracker.image("score/histogram", score_histogram(window, title), number)
+            ends = [each.episode if self.plan.unit == "episodes" else each.step for each in self.episodes]
+            picture = score_heatmap(ends, self.recent_scores(played.episode), self.plan.length, self.plan.unit)
+            self.tracker.image("score/heatmap", picture, number)
+
+    def curves(self, counters: Counters) -> None:
+        """Write down a point of every curve. Raises: Diverged."""
+        # The last multiple, not the step itself: curves of runs with different num_envs then share their grid.
+        step = counters.steps - counters.steps % self.cadence.curve_steps
+        self._pace.tick(counters.steps)  # or the first step of a session would have none
+        measures = {f"learning/{name}": value for name, value in self.learner.statistics().items()}
+        self.refuse_divergence()
+        if self.episodes:
+            last = self.recent_scores(100)
+            measures |= {
+                "score/mean_20": float(np.mean(last[-20:])),
+                "score/mean_100": float(np.mean(last)),
+                "score/best_100": max(last),
+                "score/length_mean_100": float(np.mean([played.length for played in self.episodes[-100:]])),
+            }
+        self.tracker.metrics(
+            {
+                **measures,
+                "actions/exploration_share": counters.random / counters.steps,
+                "actions/epsilon": self.plan.epsilon_at(counters),
+                "learning/learning_rate": self.learner.learning_rate,
+                "learning/updates": self.learner.updates,
+                "learning/phase": self.plan.phases.index(self.plan.phase_at(counters)),
+                "throughput/episodes": counters.episodes,
+                "throughput/frames": counters.frames,
+                "throughput/memory": len(self.memory),
+                "throughput/memory_bytes": self.memory.nbytes,
+                "throughput/steps_per_second": self._pace.steps_per_second,
+                "throughput/hours": counters.seconds / 3600,
+            },
+            step,
+        )
+
+    def refuse_divergence(self) -> None:
+        """Raise Diverged if any loss so far was infinite or no number; waits for the device."""
+        if (update := self.learner.first_nonfinite_update()) is not None:
+            raise Diverged(f"the loss of update {update} is no finite number; the run stays at its last commit")
+
+    def show(self, counters: Counters) -> None:
+        """Let a person see how far it is; to be called after every step."""
+        self._pace.tick(counters.steps)
+        if self.progress.is_due():
+            self.progress.show(self._snapshot(counters))
+
+    def evaluate(self, counters: Counters, num_envs: int, has_ended: bool, stop: Stop) -> None:
+        """Evaluate this step's network, unless that is done, and keep its weights; pending where it is stopped."""
+        if counters.steps == self.evaluated_at:
+            return
+        step = counters.steps
+        if every := self.cadence.evaluate_steps:
+            # As with the curves: one that fell due on the way to this step belongs to where it fell due.
+            due = step - step % every
+            step = due if step - due < num_envs else step
+        self.evaluation_pending = True
+        try:
+            episodes = self.cadence.final_episodes if has_ended else self.cadence.interim_episodes
+            with self._pace.paused():
+                evaluation, video = self._evaluate(episodes, self.progress, stop)
+        except Stopped:
+            return
+        self.evaluation_pending = False
+        metrics = evaluation.metrics()
+        self.tracker.metrics(metrics, step)
+        self.tracker.tags({"policy": evaluation.policy})
+        scores = [episode.score for episode in evaluation.episodes]
+        title = f"evaluation, step {step:,}"
+        self.tracker.image("evaluation/histogram", score_histogram(scores, title), self.evaluations)
+        self.evaluations += 1
+        table = evaluation_at(step)
+        self.tracker.artifact(table, evaluation.table().to_csv().encode())
+        self.tracker.artifact(table.replace(".csv", ".txt"), evaluation.report().encode())
+        weights = safetensors.torch.save(
+            {name: tensor.contiguous() for name, tensor in self.learner.evaluated.state_dict().items()}
+        )
+        results = {name: value for name, value in metrics.items() if name.startswith("evaluation/")}
+        is_best = evaluation.summary.mean > self.best_mean
+        self.tracker.model("network", weights, step, results, best=is_best)
+        if is_best:
+            self.best_mean, self.best_step = evaluation.summary.mean, step
+            self.tracker.artifact(BEST_WEIGHTS, weights)
+            self.tracker.tags({"best_evaluation": f"mean {evaluation.summary.mean:,.0f} at step {step}"})
+            if video is not None:
+                self.tracker.artifact(BEST_EPISODE, video)
+        self.evaluated_at, self.last_report = counters.steps, evaluation.report()
+        self.last_metrics = metrics
+        self._write_episodes()
+        self._describe("running", counters)
+        self.progress.evaluated(counters.steps, counters.frames, evaluation)
+
+    def recent_scores(self, count: int) -> list[float]:
+        """The scores of the last `count` episodes, the latest last."""
+        return [played.score for played in self.episodes[-count:]]
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "episodes": np.array(self.episodes).reshape(-1, len(Played._fields)),
+            "best_mean": None if np.isinf(self.best_mean) else self.best_mean,
+            "evaluations": self.evaluations,
+            "evaluated_at": self.evaluated_at,
+            "owes_evaluation": self.evaluation_pending,
+            "best_step": self.best_step,
+            "last_report": self.last_report,
+            "last_metrics": self.last_metrics,
+            "tracker": self.tracker.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        for episode, step, frames, score, length, env in state["episodes"].tolist():
+            self.episodes.append(Played(int(episode), int(step), int(frames), score, int(length), int(env)))
+        self.best_mean = -np.inf if state["best_mean"] is None else state["best_mean"]
+        self.evaluations, self.evaluated_at = state["evaluations"], state["evaluated_at"]
+        self.evaluation_pending, self.best_step = state["owes_evaluation"], state["best_step"]
+        self.last_report, self.last_metrics = state["last_report"], state["last_metrics"]
+        self.tracker.load_state_dict(state["tracker"])
+
+    def _write_episodes(self) -> None:
+        lines = [",".join(f"{value:g}" if value % 1 else f"{value:.0f}" for value in row) for row in self.episodes]
+        self.tracker.artifact(EPISODES, "\n".join([",".join(Played._fields), *lines, ""]).encode())
+
+    def _describe(self, state: str, counters: Counters) -> None:
+        """Say in a few lines of markdown what the run is, how far it is and what it has reached."""
+        reached = self.last_metrics
+        lines = [
+            self.about,
+            f"**{state}** at step {counters.steps:,}: {counters.episodes:,} episodes, {counters.frames:,} frames, "
+            f"{self.learner.updates:,} updates, {counters.seconds / 3600:.2f} hours",
+        ]
+        if reached:
+            scores = " | ".join(f"{reached[f'evaluation/{point}']:,.0f}" for point in TABLE_COLUMNS)
+            lines += [
+                "| evaluated at step | mean | +- | median | IQM | high | low | epsilon | episodes | random |\n"
+                f"|{' ---: |' * 10}\n| {self.evaluated_at:,} | {scores} | {reached['evaluation/epsilon']} | "
+                f"{reached['evaluation/episodes']:.0f} | {reached['actions/random_share']:.1%} |",
+                f"The best mean so far is {self.best_mean:,.0f}, at step {self.best_step:,}.",
+            ]
+        self.tracker.note("\n\n".join(lines))
+
+    def _snapshot(self, counters: Counters) -> Snapshot:
+        done, length = self.plan.done(counters), self.plan.length
+        left = counters.steps * (length - done) / done if done else None
+        if left is not None and self._max_steps is not None:
+            left = min(left, self._max_steps - counters.steps)
+        return Snapshot(
+            episode=counters.episodes + 1,
+            scores=self.recent_scores(20),
+            lengths=[played.length for played in self.episodes[-100:]],
+            epsilon=self.plan.epsilon_at(counters),
+            steps=counters.steps,
+            updates=self.learner.updates,
+            steps_per_second=self._pace.steps_per_second,
+            phase=self.plan.phase_at(counters).name,
+            done=done,
+            length=length,
+            steps_left=left,
+        )

@@ -1,0 +1,212 @@
+"""What a person may write on a command line, and what they are told when they may not."""
+
+import re
+from typing import Any
+
+import pytest
+
+from atlantis_exp.commands import VERBS
+from atlantis_exp.commands.baseline import BaselineConfig
+from atlantis_exp.commands.compare import CompareConfig
+from atlantis_exp.commands.evaluate import EvaluateConfig
+from atlantis_exp.commands.export import ExportConfig
+from atlantis_exp.commands.overrides import check
+from atlantis_exp.commands.play import PlayConfig
+from atlantis_exp.commands.query import QueryConfig
+from atlantis_exp.commands.report import ReportConfig
+from atlantis_exp.commands.search import SearchConfig
+from atlantis_exp.commands.sync import SyncConfig
+from atlantis_exp.commands.ui import UiConfig
+from atlantis_exp.config import Config
+from atlantis_exp.faults import ConfigError
+
+SCHEMAS: dict[str, type[Any]] = {
+    "config": Config,
+    "search": SearchConfig,
+    "evaluate": EvaluateConfig,
+    "export": ExportConfig,
+    "baseline": BaselineConfig,
+    "compare": CompareConfig,
+    "play": PlayConfig,
+    "query": QueryConfig,
+    "report": ReportConfig,
+    "sync": SyncConfig,
+    "ui": UiConfig,
+}
+
+
+MISTAKES = [  # what is written, and what the one line must hold
+    # keys
+    ("modle=cnn", "modle=cnn", "'model'"),
+    ("+modle=cnn", "+modle=cnn", "'model'"),
+    ("++modle=cnn", "++modle=cnn", "'model'"),
+    ("lr=0.1", "lr=0.1", "'optimizer.lr'"),
+    ("optimizer.l=1", "optimizer.l", "'optimizer.lr'"),
+    ("++optimizer.l=1", "optimizer.l", "'optimizer.lr'"),
+    ("optimizer.lr.x=1", "optimizer.lr.x", "'optimizer.lr'"),
+    ("+env.crop.x=1", "env.crop.x", "'env.crop'"),
+    ("objective.target.mod=train", "objective.target.mod", "'objective.target.mode'"),
+    ("epsilon=linear epsilon.decay=1", "epsilon.decay", "epsilon.duration"),
+    ("optimizer=rmsprop optimizer.beta=[0.9,0.9]", "optimizer.beta", "valid: optimizer.alpha"),
+    ("model@foo=cnn", "model@foo", "'model'"),
+    ("sampler@samplers.foo=uniform", "sampler@samplers.foo", "'sampler@samplers."),
+    ("+samplers.mine={name:uniform}", "samplers.mine", "samplers.uniform"),
+    ("+optimizer.lr=0.1", "+optimizer.lr=0.1", "write optimizer.lr=0.1"),
+    ("~optimizer.lr", "~optimizer.lr", "needed"),
+    ("~optimizer", "~optimizer", "adam, adamw, rmsprop"),
+    ("~env.size", "~env.size", "needed"),
+    ("~phase.single", "phase", "at least one phase"),
+    ("phase=two_phase ~phase.first.lr", "phase.first.lr", "missing"),
+    ("optimizer.lr=${optimizer.l}", "optimizer.l", "'optimizer.lr'"),
+    ("optimizer.lr=???", "optimizer.lr", "issing"),
+    ("samplers.uniform.name=top_half", "samplers.uniform.oversample", "missing"),
+    ("=1", "=1", "no such key"),
+    # options
+    ("model=resnt", "model=resnt", "'resnet'"),
+    ("experiment=quik", "experiment=quik", "'quick'"),
+    ("phase={}", "phase={}", "quick, single, steps, two_phase"),
+    ("env=3", "env=3", "atlantis_v0"),
+    ("model=null", "model=None", "cnn, resnet, resnet_fast"),
+    ("sampler@samplers.uniform=top", "sampler=top", "'top_half'"),
+    ("model.name=foo", "model.name=foo", "cnn, resnet, resnet_fast"),
+    ("optimizer.name=adamax", "optimizer.name=adamax", "'adam"),
+    ("objective.name=double", "objective.name=double", "'double_dqn'"),
+    ("env.id=Pong-v0", "env.id=Pong-v0", "ALE/Atlantis-v5, Atlantis-v0"),
+    ("resume=maybe", "resume=maybe", "auto, must, never"),
+    ("objective.target.mode=trian", "objective.target.mode=trian", "'train'"),
+    ("device=gpu", "device=", "auto|cpu|cuda"),
+    # types and ranges
+    ("optimizer.lr=abc", "optimizer.lr", "valid number"),
+    ("optimizer.lr=true", "optimizer.lr", "valid number"),
+    ("optimizer.lr=0", "optimizer.lr=0", "greater than 0"),
+    ("optimizer.lr=-1", "optimizer.lr=-1", "greater than 0"),
+    ("optimizer.lr=nan", "optimizer.lr", "finite"),
+    ("optimizer.lr=${oc.env:HOME}", "optimizer.lr", "valid number"),
+    ("optimizer.betas=[0.9]", "optimizer.betas.1", "missing"),
+    ("optimizer.betas=[0.9,0.9,0.9]", "optimizer.betas", "at most 2"),
+    ("optimizer.betas=[0.9,1.0]", "optimizer.betas.1=1.0", "less than 1"),
+    ("seed=-1", "seed=-1", "greater than or equal to 0"),
+    ("seed=1.5", "seed=1.5", "valid integer"),
+    ("seed=true", "seed=true", "valid integer"),
+    ("seed=", "seed=", "valid integer"),
+    ("seed=99999999999999999999", "seed=99999999999999999999", "less than"),
+    ("threads=0", "threads=0", "greater than or equal to 1"),
+    ("epsilon.start=1.5", "epsilon.start=1.5", "less than or equal to 1"),
+    ("objective.gamma=1", "objective.gamma=1", "less than 1"),
+    ("objective.n_step=0", "objective.n_step=0", "greater than or equal to 1"),
+    ("objective.reward_clip=0", "objective.reward_clip=0", "greater than 0"),
+    ("objective.target.every=0", "objective.target.every=0", "greater than or equal to 1"),
+    ("objective.quantiles=51", "objective.quantiles", "no such key"),
+    ("objective.target.tau=2", "objective.target.tau=2", "less than or equal to 1"),
+    ("env.sticky=true", "env.sticky=true", "valid number"),
+    ("env.size=999", "env.size=999", "less than or equal to 210"),
+    ("env.crop=5", "env.crop=5", "valid array"),
+    ("env.crop=[0,160]", "env.crop.2", "missing"),
+    ("env.crop=[0,160,210,0,1]", "env.crop=", "at most 4"),
+    ("env.crop=[0,160,210,a]", "env.crop.3", "valid integer"),
+    ("env.frameskip=0", "env.frameskip=0", "greater than or equal to 1"),
+    ("env.frameskip=often", "env.frameskip", "valid integer or be a valid array"),
+    ("tracking.experiment=../x", "tracking.experiment", "pattern"),
+    ("paths.outputs=", "paths.outputs", "at least 1"),
+    ("paths.outputs=null", "paths.outputs", "valid string"),
+    # one key against another
+    ("training.batch_size=2_000_000", "training.batch_size=2000000", "at most 1000000"),
+    ("training.learn_start=999_995", "training.learn_start=999995", "less than 999995"),
+    ("env.num_envs=4 training.learn_start=999_980", "training.learn_start=999980", "less than 999980"),
+    ("env.crop=[90,160,90,0]", "env.crop=[90, 160, 90, 0]", "UP < DOWN <= 210"),
+    ("env.crop=[0,161,210,0]", "env.crop", "RIGHT <= 160"),
+    ("env.crop=[-1,160,210,0]", "env.crop", "0 <= UP"),
+    ("env.size=35", "env.size=35", "at least 36"),
+    ("model.head=quantile", "model.head=quantile", "objective.name=dqn"),
+    ("objective=quantile model.head=plain", "model.head=plain", "objective.name=quantile"),
+    ("experiment=fast model.head=dueling", "model.head=dueling", "model.head=quantile and objective=quantile"),
+    ("objective=double_quantile model.head=plain", "model.head=plain", "objective.name=double_quantile"),
+    ("objective=double_quantil", "objective=double_quantil", "'double_quantile'"),
+    ("objective=double_dqn model.head=quantil", "model.head=quantil", "'quantile'"),
+    ("model=resnet env.size=14", "env.size=14", "at least 15"),
+    ("env.frameskip=[5,2]", "env.frameskip=[5, 2]", "low"),
+    ("env=atlantis_standard env.frameskip=1", "env.max_pool", "at least 2"),
+    ("env.max_pool=true", "env.max_pool", "fixed env.frameskip"),
+    ("phase=two_phase phase.second.sampler=tophalf", "phase.second.sampler=tophalf", "'top_half'"),
+    ("phase.single.steps=5", "phase.single", "either episodes or steps"),
+    ("phase.single.episodes=null", "phase.single", "either episodes or steps"),
+    ("phase=two_phase phase.first.episodes=null phase.first.steps=9", "phase", "same unit"),
+    # sweeps and flags
+    ("seed=0,1", "seed=0,1", "-m"),
+    ("seed=range(0,3)", "seed=range(0,3)", "-m"),
+    ("--cfg job seed=0,1", "seed=0,1", "-m"),
+    ("--cfg job optimizer.lr=-1", "optimizer.lr=-1", "greater than 0"),
+    ("--cfg foo", "--cfg", "job"),
+    ("--cfg", "--cfg", "argument"),
+    ("-m model=cnn,resnt", "model=resnt", "'resnet'"),
+    ("-m seed=0,1,-1", "seed=-1", "greater than or equal to 0"),
+    ("-m model=cnn,resnet env.size=20,84", "env.size=20", "at least 36"),
+    ("model=cnn -m seed=0,1", "seed=0,1", "together"),
+    ("--multi", "--multi", "'--multirun'"),
+    ("--frobnicate", "--frobnicate", "no such flag"),
+    ("--config-name=query", "--config-name", "overrides"),
+    ("-cn query", "--config-name", "overrides"),
+    ("--config-path=/tmp", "--config-path", "overrides"),
+    ("--config-dir=/tmp", "--config-dir", "overrides"),
+    ("--experimental-rerun=x.pickle", "--experimental-rerun", "overrides"),
+    ("--info everything", "--info", "defaults"),
+    ("hydra.foo=1", "hydra.foo", ""),
+    ("hydra/launcher=lsf", "hydra/launcher", "basic"),
+    ("hydra.mode=FOO", "hydra.mode=FOO", ""),
+    # writing
+    ("model", "'model'", "KEY=VALUE"),
+    ("env.crop=[1", "env.crop=[1", "KEY=VALUE"),
+    ("sämpler=uniform", "sämpler=uniform", "quotes"),
+    ("seed=☃", "seed=☃", "quotes"),
+    ("seed='☃'", "seed=", "valid integer"),
+    # other verbs
+    ("query model=cnn", "model=cnn", "no such key"),
+    ("query env=atlantis", "env=atlantis", "'atlantis_v"),
+    ("query env.siz=1", "env.siz", "'env.size'"),
+    ("baseline agent=rndom", "agent=rndom", "'random'"),
+    ("baseline agent.action=4", "agent.action=4", "less than or equal to 3"),
+    ("baseline optimizer.lr=1", "optimizer.lr=1", "no such key"),
+    ("evaluate evaluation.epsilon=2", "evaluation.epsilon=2", "less than or equal to 1"),
+    ("evaluate epsilom=0.1", "epsilom=0.1", "no such key"),
+    ("evaluate weights=first", "weights=first", "best, latest"),
+    ("evaluate weights=bst", "weights=bst", "'best'"),
+    ("export weights=pretrained/fast", "weights=pretrained/fast", "best, latest"),
+    ("export too=pretrained/fast", "too=pretrained/fast", "'to'"),
+    ("report paths.output=x", "paths.output", "'paths.outputs'"),
+    ("ui port=80", "port=80", "greater than or equal to 1024"),
+]
+
+
+@pytest.mark.parametrize(("line", "key", "hint"), MISTAKES, ids=[line for line, _, _ in MISTAKES])
+def test_a_mistake_is_one_line_that_names_the_key_and_what_would_be_right(line: str, key: str, hint: str) -> None:
+    words = line.split(" ")
+    verb = words.pop(0) if words[0] in VERBS else "config"
+    with pytest.raises(ConfigError) as caught:
+        check(verb, SCHEMAS[verb], words)
+    message = str(caught.value)
+    assert key in message
+    assert hint in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "",
+        "model=resnet sampler=top_half",
+        "-m model=cnn,resnet sampler=uniform,top_half",
+        "seed=0,1 hydra.mode=MULTIRUN",
+        "phase=two_phase sampler=top_half phase.second.lr=1e-4 phase.second.sampler=uniform",
+        "phase=two_phase ~phase.second",
+        "optimizer.lr=1",
+        "++optimizer.lr=1e-4",
+        "sampler@samplers.uniform=uniform",
+        "env.frameskip=4 env.crop=[0,160,210,0] --cfg job --resolve",
+        "paths.outputs='/tmp/ü und ü'",
+        "hydra.verbose=true",
+        "device=cuda:1 threads=4",
+        "--help",
+    ],
+)
+def test_what_is_right_passes(line: str) -> None:
+    check("config", Config, re.findall(r"(?:[^ ']|'[^']*')+", line))

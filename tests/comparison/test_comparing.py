@@ -1,0 +1,118 @@
+"""The verb compare, from the command line to the page and the store."""
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import mlflow
+import pytest
+
+from atlantis_exp.config import Config
+from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.training import train
+
+Command = Callable[..., int]
+Recorded = Callable[..., Path]
+
+
+def test_a_comparison_is_a_page_figures_and_tables_in_a_folder_and_in_the_store(
+    command: Command,
+    recorded: Recorded,
+    mlflow_tables: Callable[[Path], None],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    mlflow_tables(tmp_path)  # which says so where they are the first
+    capsys.readouterr()
+    for seed in range(3):
+        recorded("model=cnn", f"seed={seed}", scores=(1_000.0 + seed, 1_200.0))
+        recorded("model=resnet", f"seed={seed}", scores=(9_000.0 + seed, 9_200.0))
+    (tmp_path / "runs" / "foreign").mkdir()
+    words = (f"paths.outputs={tmp_path}", "by=model,seed", "where=model=cnn")
+    assert command("compare", *words, "resamples=100") == 0
+    assert command("compare", f"paths.outputs={tmp_path}", "resamples=100") == 0
+    shown = capsys.readouterr()
+    assert shown.err == "atlantis_exp: left out foreign: foreign: it has no config.json\n" * 2
+    assert "resnet plays better than cnn, by 8,000 points of evaluation IQM" in " ".join(shown.out.split())
+    path = Path(shown.out.rstrip().splitlines()[-1])
+    assert path.name == "comparison.html"
+    assert path.is_relative_to(tmp_path / "comparisons")
+    assert "resnet plays better than cnn" in path.read_text()
+    assert len(list((path.parent / "figures").glob("*.png"))) == 9
+    with open(path.parent / "tables" / "runs.csv") as file:
+        assert len(list(csv.DictReader(file))) == 6
+
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path}/mlflow.db")
+    experiment = client.get_experiment_by_name("atlantis")
+    assert experiment is not None
+    stored, small = client.search_runs([experiment.experiment_id])
+    assert stored.info.status == "FINISHED"
+    assert stored.info.run_name == path.parents[1].name
+    assert stored.data.tags["atlantis.kind"] == "comparison"
+    assert "resnet plays better" in stored.data.tags["mlflow.note.content"]
+    assert stored.data.metrics["evaluation/difference"] == 8_000
+    assert {item.path for item in client.list_artifacts(stored.info.run_id)} == {"comparison.html", "figures", "tables"}
+    assert "cnn-seed-0-vs-cnn-seed-1" in str(small.info.run_name)
+
+
+@pytest.mark.slow
+def test_the_same_comparison_again_is_the_same_run(command: Command, recorded: Recorded, tmp_path: Path) -> None:
+    recorded()
+    for _ in range(2):
+        assert command("compare", f"paths.outputs={tmp_path}", "tracking=none", "resamples=100") == 0
+    assert len(list((tmp_path / "comparisons").iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words", "line"),
+    [
+        (("env.crop=[0,160,210,0]",), (), "env.crop differs, so the scores do not mean the same: "),
+        (("evaluation.epsilon=0.3",), (), "evaluation.epsilon differs"),
+        ((), ("by=modle",), "by=modle: no such key"),
+        ((), ("where=seed=5",), "there is no finished training"),
+        ((), ("at_epsilon=2",), "at_epsilon=2: should be less"),
+        ((), ("resample=2",), "resample=2: no such key; did you mean 'resamples'"),
+    ],
+)
+def test_a_refusal_is_one_line_and_code_2_and_leaves_nothing_behind(
+    command: Command,
+    recorded: Recorded,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    overrides: tuple[str, ...],
+    words: tuple[str, ...],
+    line: str,
+) -> None:
+    recorded()
+    recorded("seed=1", *overrides)
+    assert command("compare", f"paths.outputs={tmp_path}", *words, "resamples=100") == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"atlantis_exp: {line}")
+    assert error.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
+@pytest.mark.slow
+def test_a_real_training_can_be_compared(
+    command: Command, tiny: Callable[..., Config], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seed in (0, 1):
+        train(Job(tiny(f"seed={seed}")))
+    assert command("compare", f"paths.outputs={tmp_path}", "tracking=none", "by=seed", "resamples=100") == 0
+    shown = capsys.readouterr()
+    assert shown.err == ""
+    page = Path(shown.out.rstrip().splitlines()[-1])
+    with open(page.parent / "tables" / "runs.csv") as file:
+        runs = list(csv.DictReader(file))
+    for row in runs:
+        result = json.loads((tmp_path / "runs" / row["run"] / "result.json").read_bytes())
+        assert float(row["mean"]) == result["evaluation"]["evaluation/mean"]
+        assert float(row["iqm"]) == result["evaluation"]["evaluation/interquartile_mean"]
+        assert float(row["frames"]) == result["counts"]["frames"]
+        assert float(row["flops"]) > 0
+    with open(page.parent / "tables" / "actions.csv") as file:
+        shares = [
+            float(row["network"]) + float(row["random"]) for row in csv.DictReader(file) if row["group"] == "seed=0"
+        ]
+    assert sum(shares) == pytest.approx(1)

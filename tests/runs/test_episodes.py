@@ -1,0 +1,92 @@
+"""The table of evaluated episodes: what is written is what is read."""
+
+from dataclasses import fields
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from atlantis_exp.runs.episodes import EpisodeTable
+from atlantis_exp.training.evaluation import Episode, Evaluation
+
+GOLDEN = """\
+episode,seed,score,steps,frames,truncated,random,NOOP,FIRE,RIGHTFIRE,LEFTFIRE,\
+NOOP_random,FIRE_random,RIGHTFIRE_random,LEFTFIRE_random
+0,1,300.0,4,12,0,1,1,2,0,1,1,0,0,0
+1,4294967295,900.0,2,6,1,1,0,0,0,2,0,0,0,1
+"""
+EVALUATION = Evaluation(
+    0.1,
+    [
+        Episode(1, 300.0, 12, False, bytearray([0, 1, 1, 3]), bytearray([1, 0, 0, 0])),
+        Episode(2**32 - 1, 900.0, 6, True, bytearray([3, 3]), bytearray([1, 0])),
+    ],
+)
+
+episodes = st.tuples(
+    st.integers(0, 2**32 - 1),  # seed
+    st.floats(0, 1e9),  # score
+    st.integers(0, 10**6),  # frames
+    st.booleans(),  # truncated
+    st.lists(st.tuples(st.integers(0, 10**5), st.integers(0, 10**5)), min_size=4, max_size=4),  # steps by action
+)
+
+
+def assert_equal(one: EpisodeTable, other: EpisodeTable) -> None:
+    assert one.actions == other.actions
+    for name in (field.name for field in fields(EpisodeTable) if field.name != "actions"):
+        ours, theirs = getattr(one, name), getattr(other, name)
+        assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape), name
+        assert np.array_equal(ours, theirs), name
+
+
+def test_the_table_of_an_evaluation_is_the_text_that_stored_runs_have() -> None:
+    assert EVALUATION.table().to_csv() == GOLDEN
+
+
+def test_a_stored_table_is_read(tmp_path: Path) -> None:
+    (tmp_path / "episodes.csv").write_text(GOLDEN)
+    table = EpisodeTable.read(tmp_path / "episodes.csv")
+    assert_equal(table, EVALUATION.table())
+    assert table.actions == ("NOOP", "FIRE", "RIGHTFIRE", "LEFTFIRE")
+    assert table.seeds.tolist() == [1, 2**32 - 1]
+    assert table.truncated.tolist() == [0, 1]
+    assert table.counts.tolist() == [[[0, 1], [2, 0], [0, 0], [1, 0]], [[0, 0], [0, 0], [0, 0], [1, 1]]]
+
+
+@given(st.lists(episodes, min_size=1, max_size=5))
+def test_writing_and_reading_are_inverse(rows: list[tuple[int, float, int, bool, list[tuple[int, int]]]]) -> None:
+    counts = np.array([row[4] for row in rows], np.float64)
+    table = EpisodeTable(
+        actions=("NOOP", "FIRE", "RIGHTFIRE", "LEFTFIRE"),
+        seeds=np.array([row[0] for row in rows], np.int64),
+        scores=np.array([row[1] for row in rows], np.float64),
+        steps=counts.sum((1, 2)),
+        frames=np.array([row[2] for row in rows], np.float64),
+        truncated=np.array([row[3] for row in rows], np.float64),
+        counts=counts,
+    )
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "episodes.csv")
+        path.write_text(table.to_csv())
+        again = EpisodeTable.read(path)
+    assert_equal(again, table)
+    assert again.to_csv() == table.to_csv()
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("", "has no episode"),
+        (GOLDEN.splitlines()[0], "has no episode"),
+        ("episode,seed,score,steps,frames,truncated\n0,1,300.0,4,12,0\n", "does not say who chose the actions"),
+        (GOLDEN.replace("300.0", "many"), "could not convert"),
+    ],
+)
+def test_what_is_no_table_is_refused(tmp_path: Path, text: str, fault: str) -> None:
+    (tmp_path / "episodes.csv").write_text(text)
+    with pytest.raises(ValueError, match=fault):
+        EpisodeTable.read(tmp_path / "episodes.csv")

@@ -1,0 +1,115 @@
+"""Who holds a folder, told by and to other processes."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+from atlantis_exp.faults import Fault
+from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.runs.lock import alone, held, is_held
+
+REPOSITORY = Path(__file__).parents[2]
+HOLDER = """
+import sys
+from pathlib import Path
+from atlantis_exp.runs.lock import held
+with held(Path(sys.argv[1]), "run x", 0):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@contextmanager
+def holder(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that holds a folder until its input ends, or it does."""
+    command = (sys.executable, "-c", HOLDER, folder)
+    with subprocess.Popen(command, cwd=REPOSITORY, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        yield process
+
+
+def test_a_folder_that_another_process_holds_is_refused_with_its_name(tmp_path: Path) -> None:
+    with holder(tmp_path) as process:
+        assert is_held(tmp_path)
+        with pytest.raises(Fault) as refused, held(tmp_path, "run y", 0.0):
+            pass
+        assert str(refused.value) == f"run y is held by process {process.pid} on {os.uname().nodename}"
+        assert refused.value.exit_code == 75
+        assert is_held(tmp_path)  # to ask does not take it away
+    assert process.returncode == 0
+    assert not is_held(tmp_path)
+
+
+def test_a_folder_is_free_once_its_holder_is_killed(tmp_path: Path) -> None:
+    with holder(tmp_path) as process:
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+        assert not is_held(tmp_path)
+        with held(tmp_path, "run x", 0.0):
+            assert is_held(tmp_path)
+            assert (tmp_path / "holder.txt").read_text() == f"process {os.getpid()} on {os.uname().nodename}\n"
+
+
+def test_a_folder_is_waited_for(tmp_path: Path) -> None:
+    with holder(tmp_path) as process:
+        assert process.stdin is not None
+        threading.Timer(0.2, process.stdin.close).start()
+        with held(tmp_path, "run x", 60.0):
+            assert is_held(tmp_path)
+
+
+def test_a_holder_that_has_not_said_its_name_is_another_process(tmp_path: Path) -> None:
+    with holder(tmp_path):
+        (tmp_path / "holder.txt").unlink()
+        with pytest.raises(Fault, match=r"^run x is held by another process$"), held(tmp_path, "run x", 0.0):
+            pass
+
+
+def test_a_folder_is_held_against_this_process_too_until_the_block_ends_however_it_does(tmp_path: Path) -> None:
+    folder = tmp_path / "runs" / "x"
+    assert not is_held(folder)
+    assert not folder.exists()  # to ask makes no folder
+    with suppress(KeyError), held(folder, "run x", 0.0):
+        assert is_held(folder)
+        with pytest.raises(Fault, match=f"process {os.getpid()} "), held(folder, "run x", 0.0):
+            pass
+        raise KeyError
+    assert not is_held(folder)
+
+
+def test_a_run_folder_names_itself(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "cnn-0")
+    with holder(folder.path) as process:
+        assert folder.is_held
+        with pytest.raises(Fault, match=f"^run cnn-0 is held by process {process.pid} on "), folder.held():
+            pass
+    assert not folder.is_held
+    with folder.held():
+        assert folder.is_held
+
+
+def test_those_who_want_to_be_alone_come_one_after_the_other(tmp_path: Path) -> None:
+    inside, most = 0, 0
+
+    def work() -> None:
+        nonlocal inside, most
+        for _ in range(5):
+            with alone(tmp_path / "made" / "by.lock"):
+                inside += 1
+                most = max(most, inside)
+                inside -= 1
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (inside, most) == (0, 1)

@@ -1,0 +1,143 @@
+"""Folders of exported weights: how they play, what is packed, and what is refused."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.numpy
+import safetensors.torch
+
+from atlantis_exp.build import build_network
+from atlantis_exp.checking import parse, to_dict
+from atlantis_exp.config import Config
+from atlantis_exp.faults import Fault
+from atlantis_exp.sessions.cards import MOST_BYTES, Card, pack, portable
+
+Command = Callable[..., int]
+Compose = Callable[..., Config]
+
+
+@pytest.fixture
+def folder(tiny: Compose, tmp_path: Path) -> Path:
+    """A folder of exported weights that nobody has trained."""
+    config = portable(tiny("evaluation.epsilon=0.9", "evaluation.seed=5"))
+    weights = safetensors.torch.save(build_network(config, "network").state_dict())
+    card = Card(
+        format=1,
+        run="cnn",
+        weights="latest",
+        step=160,
+        reached={},
+        made={},
+        precision="float32",
+        sha256=hashlib.sha256(weights).hexdigest(),
+        config=config,
+        evaluation=config.evaluation,
+        scores=[100.0],
+    )
+    path = tmp_path / "pretrained" / "untrained"
+    path.mkdir(parents=True)
+    (path / "weights.safetensors").write_bytes(weights)
+    (path / "card.json").write_text(json.dumps(to_dict(card)))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "line"),
+    [
+        ("sha256", "0" * 64, "does not have the checksum of its card"),
+        ("config.env.size", 84, "another network's"),
+        ("config.env.siz", 40, "card.json: config.env.siz: no such key; did you mean 'size'?"),
+        ("config.model._target_", "os.system", "card.json: config.model._target_: no such key"),
+        ("config.model.name", "rnn", "card.json: config.model.name=rnn: no such choice"),
+        ("config.env.crop", [0, 999, 210, 0], "card.json: env.crop=[0, 999, 210, 0]"),
+        ("evaluation.episodes", 0, "card.json: evaluation.episodes=0: should be greater than or equal to 1"),
+        ("format", 2, "card.json: format=2"),
+        ("scores", [], "card.json: scores=[]"),
+    ],
+)
+def test_a_folder_that_was_tampered_with_is_one_line(
+    command: Command, folder: Path, capsys: pytest.CaptureFixture[str], key: str, value: Any, line: str
+) -> None:
+    tree = json.loads((folder / "card.json").read_text())
+    *path, last = key.split(".")
+    node = tree
+    for part in path:
+        node = node[part]
+    node[last] = value
+    (folder / "card.json").write_text(json.dumps(tree))
+    assert command("evaluate", f"weights={folder}", f"paths.outputs={folder.parent}/o") in (1, 2)
+    error = capsys.readouterr().err
+    assert line in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("asked", "protocol"),
+    [
+        pytest.param(("evaluation.num_envs=2",), ["2", "0.9", "5"], marks=pytest.mark.slow),
+        pytest.param(("episodes=1",), ["1", "0.9", "5"], marks=pytest.mark.slow),
+        (("evaluation=quick", "episodes=1"), ["1", "0.05", "1000003"]),
+    ],
+)
+def test_another_protocol_than_the_card_s_is_played_where_the_command_line_says_so(
+    command: Command,
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    asked: tuple[str, ...],
+    protocol: list[str],
+) -> None:
+    outputs = (f"paths.outputs={folder.parent}/o", "device=cpu", "tracking=none")
+    assert command("evaluate", f"weights={folder}", *outputs, *asked, "evaluation.video=false") == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("│ here")]
+    assert [cell.strip() for cell in line.split("│")][-4:-1] == protocol
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"format": 1}'])
+def test_a_card_that_is_none_is_one_line(
+    command: Command, folder: Path, capsys: pytest.CaptureFixture[str], content: str
+) -> None:
+    (folder / "card.json").write_text(content)
+    assert command("evaluate", f"weights={folder}", f"paths.outputs={folder.parent}/o") == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"atlantis_exp: {folder}/card.json: ")
+    assert error.count("\n") == 1
+
+
+def test_a_misspelt_folder_and_a_run_beside_a_folder_are_one_line(
+    command: Command, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    outputs = f"paths.outputs={folder.parent}/o"
+    assert command("evaluate", f"weights={folder.parent}/untraind", outputs) == 2
+    assert f"did you mean '{folder}'?" in capsys.readouterr().err
+    assert command("evaluate", f"weights={folder}", "run=latest", outputs) == 2
+    assert capsys.readouterr().err.startswith("atlantis_exp: run=latest: ")
+
+
+def test_weights_are_packed_in_half_precision_only_where_they_have_to_be() -> None:
+    def file(megabytes: float) -> bytes:
+        count = int(megabytes * 250_000)
+        return safetensors.numpy.save({"w": np.linspace(-1, 1, count, dtype=np.float32), "n": np.array([3])})
+
+    assert pack(file(7.9)) == (file(7.9), "float32")
+    packed, precision = pack(file(15.9))
+    assert precision == "float16"
+    assert len(packed) <= MOST_BYTES == 8_000_000
+    arrays = safetensors.numpy.load(packed)
+    assert arrays["w"].dtype == np.float16
+    assert arrays["n"].tolist() == [3]
+    with pytest.raises(Fault, match=r"16,100,1.. bytes in half precision; an export has 8,000,000 at most"):
+        pack(file(32.2))
+
+
+def test_a_card_holds_nothing_of_the_machine_and_all_of_the_science(tiny: Compose) -> None:
+    config = tiny("env.workers=1", "tracking.uri=http://10.0.0.1:5000")
+    card = portable(config)
+    assert card.science() == config.science()
+    assert card.identity() == config.identity()
+    assert (card.env.workers, card.tracking.uri, card.threads, card.paths.outputs) == (None, None, None, "outputs")
+    assert parse(Config, to_dict(card)) == card

@@ -1,0 +1,76 @@
+"""Exported weights: what a folder of them holds, and when there is none."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from atlantis_exp.config import Config
+from atlantis_exp.sessions import cards
+from atlantis_exp.sessions.cards import read_card
+from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.training import train
+
+Command = Callable[..., int]
+Compose = Callable[..., Config]
+
+
+@pytest.fixture
+def trained(tiny: Compose) -> Path:
+    """The outputs folder of a training with evaluations at steps 80 and 160."""
+    config = tiny("env.max_steps=200")
+    train(Job(config))
+    return Path(config.paths.outputs)
+
+
+def test_exported_weights_score_what_their_card_says(
+    command: Command, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In half precision, which is what this limit takes."""
+    monkeypatch.setattr(cards, "MOST_BYTES", 300_000)
+    folder = tmp_path / "pretrained" / "tiny"
+    outputs = (f"paths.outputs={trained}", "device=cpu")
+    assert command("export", f"to={folder}", "episodes=3", "epsilon=0.9", "evaluation.num_envs=1", *outputs) == 0
+
+    card, weights = read_card(folder)
+    assert card.precision == "float16"
+    best = safetensors.numpy.load_file(next(trained.glob("runs/*/artifacts/best.safetensors")))
+    for name, array in safetensors.numpy.load(weights).items():
+        np.testing.assert_array_equal(array, best[name].astype(np.float16))
+    (trained_step,) = {int(path.stem) for path in trained.glob("runs/*/artifacts/evaluation/*.csv")} & {card.step}
+    assert (card.weights, trained_step) == ("best", card.step)
+    assert card.reached["frames"] >= 2 * card.step
+    assert len(card.scores) == 3
+    assert len(set(card.scores)) > 1
+    page = (folder / "README.md").read_text()
+    assert card.sha256 in page
+    assert f"| {np.mean(card.scores):,.0f} |" in page
+    assert not any(str(trained) in path.read_text() for path in (folder / "README.md", folder / "card.json"))
+
+    capsys.readouterr()
+    played = (f"weights={folder}", *outputs, "tracking=none")
+    assert command("evaluate", *played) == 0
+    table = [[cell.strip() for cell in line.split("│")] for line in capsys.readouterr().out.splitlines()]
+    rows = {row[1]: row[2:-1] for row in table if len(row) > 3}
+    assert rows["card"] == rows["here"]
+    assert rows["card"][-3:] == ["3", "0.9", "2000003"]
+    (recorded,) = (trained / "evaluations").iterdir()
+    facts = json.loads((recorded / "config.json").read_text())
+    assert (facts["sha256"], facts["evaluation"]["num_envs"]) == (card.sha256, 1)
+    assert (recorded / "artifacts" / "best_episode.mp4").stat().st_size > 1_000
+
+
+def test_an_export_neither_overwrites_nor_starts_without_weights(
+    command: Command, tiny: Compose, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tiny("evaluation.at_end=false", "evaluation.every_steps=null", "phase.quick.steps=40")
+    train(Job(config))
+    outputs = f"paths.outputs={config.paths.outputs}"
+    assert command("export", outputs, f"to={tmp_path}/new") == 1
+    assert "so no best weights" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+    assert command("export", outputs, "weights=latest", f"to={tmp_path}") == 2
+    assert capsys.readouterr().err == f"atlantis_exp: to={tmp_path}: is not empty; name another folder\n"

@@ -1,0 +1,257 @@
+"""Sweeps whose jobs other processes do: what becomes of all when one of them, or the sweep, is ended."""
+
+import dataclasses
+import io
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from atlantis_exp.build import build_emulators
+from atlantis_exp.commands.overrides import check, launcher
+from atlantis_exp.config import Config, PathsConfig
+from atlantis_exp.faults import ConfigError
+from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.runs.journal import Journal, read_commit
+from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.launchers import BASIC, Launcher
+from atlantis_exp.sessions.launchers.joblib import _shared_cores
+from atlantis_exp.sessions.live import LiveTable
+from atlantis_exp.sessions.training import train
+from atlantis_exp.sessions.verifying import fingerprints
+
+REPOSITORY = Path(__file__).parents[2]
+FREQUENT = ("tracking=mlflow", "tracking.commit_seconds=0.5", "evaluation.every_steps=null")
+LONG = (*FREQUENT, "phase.quick.steps=100_000")
+
+Compose = Callable[..., Config]
+Sweep = Callable[..., subprocess.Popen[bytes]]
+
+
+@pytest.fixture
+def sweep(tiny_overrides: tuple[str, ...], tmp_path: Path) -> Iterator[Sweep]:
+    """Starts a sweep as a shell does, in a process group of its own; what it prints is in `printed.txt`."""
+    started = []
+
+    def start(*overrides: str) -> subprocess.Popen[bytes]:
+        chosen = [word for word in tiny_overrides if word != "tracking=none"]
+        command = (sys.executable, "-m", "atlantis_exp", "-m", *chosen, f"paths.outputs={tmp_path / 'o'}", *overrides)
+        environment = {key: value for key, value in os.environ.items() if key != "OMP_NUM_THREADS"}
+        with open(tmp_path / "printed.txt", "w") as printed:
+            process = subprocess.Popen(
+                command,
+                cwd=REPOSITORY,
+                env=environment,
+                stdout=printed,
+                stderr=printed,
+                start_new_session=True,
+            )
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def holder(folder: RunFolder) -> int:
+    """The process that trains a run."""
+    return int((folder.path / "holder.txt").read_text().split()[1])
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    patience = time.monotonic() + 150
+    while not condition():
+        assert time.monotonic() < patience
+        time.sleep(0.1)
+
+
+def trains(folder: RunFolder) -> bool:
+    commit = read_commit(folder.path)
+    return folder.state == "running" and commit is not None and commit.offset > 0
+
+
+def statuses(config: Config) -> list[str]:
+    """Of the runs in MLflow, by the time of their making, the sweep first."""
+    with closing(sqlite3.connect(Path(config.paths.outputs) / "mlflow.db")) as database:
+        query = "SELECT status FROM runs ORDER BY name LIKE 'sweep%' DESC, name"
+        return [status for (status,) in database.execute(query)]
+
+
+@pytest.fixture
+def seeds(tiny: Compose, tmp_path: Path) -> Callable[..., list[Config]]:
+    """The configs of the sweep seed=0,1,2."""
+    return lambda *words: [
+        dataclasses.replace(tiny(*words), seed=seed, paths=PathsConfig(outputs=str(tmp_path / "o")))
+        for seed in (0, 1, 2)
+    ]
+
+
+def test_the_launcher_of_a_command_line_is_known_and_a_missing_extra_is_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the extra joblib is not installed")
+    words = ["seed=0,1", "hydra/launcher=joblib", "hydra.launcher.n_jobs=3"]
+    assert launcher("config", words) == launcher("config", ["-m", "seed=0,1"]) == BASIC
+    assert launcher("config", ["-m", *words]) == Launcher("joblib", 3)
+    with pytest.raises(ConfigError, match=r"n_jbos"):
+        check("config", Config, ["-m", "seed=0,1", "hydra/launcher=joblib", "hydra.launcher.n_jbos=3"])
+    monkeypatch.setitem(sys.modules, "hydra_plugins.hydra_joblib_launcher.joblib_launcher", None)
+    with pytest.raises(ConfigError, match=r"^hydra/launcher=joblib: needs pip install 'atlantis-exp\[joblib\]'$"):
+        check("config", Config, ["-m", "seed=0,1", "hydra/launcher=joblib"])
+
+
+@pytest.mark.parametrize(("n_jobs", "share"), [(1, 8), (2, 4), (3, 2), (16, 2), (-1, 2)])
+def test_jobs_share_the_cores_of_the_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_jobs: int, share: int
+) -> None:
+    joblib = pytest.importorskip("joblib", reason="the extra joblib is not installed")
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(joblib, "cpu_count", lambda: 8)
+    monkeypatch.setattr(joblib, "effective_n_jobs", lambda jobs: 8 if jobs == -1 else jobs)
+    with _shared_cores(Launcher("joblib", n_jobs), [RunFolder(tmp_path / name) for name in "abc"]):
+        assert os.environ["OMP_NUM_THREADS"] == str(share)
+    assert "OMP_NUM_THREADS" not in os.environ
+
+
+def test_emulator_workers_keep_to_their_share_and_leave_the_identity_alone(
+    tiny: Compose, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(3)))
+    config = tiny("env.num_envs=4")
+    for share, workers in (("2", 2), ("64", 3), ("", 3)):
+        monkeypatch.setenv("OMP_NUM_THREADS", share)
+        with build_emulators(config.env, 4) as emulators:
+            assert len(emulators._processes) == workers  # type: ignore[attr-defined]
+
+
+def test_the_table_follows_the_commits_of_runs(tiny: Compose, recorded: Callable[..., Path]) -> None:
+    jobs = [Job(tiny(f"seed={seed}")) for seed in (0, 1)]
+    folders = [RunFolder.of(job.config) for job in jobs]
+    folder = folders[0]
+    shown = io.StringIO()
+    with folder.held():
+        journal = Journal(folder.path)
+        folder.write_config({})
+        journal.status("RUNNING")
+        table = LiveTable(jobs, folders, Console(file=shown, width=200))
+        for step in (40, 80):
+            journal.metrics({"throughput/steps_per_second": 20.0, "throughput/hours": step / 72_000}, step)
+            journal.metrics({"score/episode": 100.0 * step}, step)
+            journal.state_dict()
+            journal.commit()
+            table.look()
+            journal.metrics({"score/episode": -1.0}, step + 1)  # which no commit covers yet
+            journal.state_dict()
+            table.look()
+    recorded("seed=1")
+    table.look()
+    drawn = io.StringIO()
+    LiveTable(jobs, folders, Console(file=drawn, width=120, force_terminal=True)).look()
+    assert "80 of 160 steps" in drawn.getvalue()
+    lines = shown.getvalue().splitlines()
+    assert [line.split()[0] for line in lines] == ["running", "running", "interrupted", "done"]
+    assert "80 of 160 steps" in lines[1]
+    assert "20 steps/s" in lines[1]
+    assert "left 0:00:0" in lines[1]
+    assert "last score 8,000" in lines[1]
+
+
+@pytest.mark.slow
+def test_jobs_side_by_side_fail_and_are_killed_alone_and_the_same_command_runs_what_is_missing(
+    sweep: Sweep, seeds: Callable[..., list[Config]], tiny: Compose, tmp_path: Path
+) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the extra joblib is not installed")
+    words = (*FREQUENT, "phase.quick.steps=400")
+    configs = seeds(*words)
+    killed, failing, whole = (RunFolder.of(config) for config in configs)
+    failing.path.mkdir(parents=True)
+    (failing.path / "checkpoints").write_text("in the way")
+    command = (*words, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1,2")
+    process = sweep(*command)
+    wait_for(lambda: trains(killed))
+    os.kill(holder(killed), signal.SIGKILL)
+    assert process.wait(timeout=200) == 128 + signal.SIGKILL  # of the first job that did not end well
+    printed = (tmp_path / "printed.txt").read_text()
+    assert f"interrupted {killed.name}: killed by SIGKILL" in printed
+    assert f"failed      {failing.name}: " in printed
+    assert f"({failing.path / 'traceback.txt'})" in printed
+    assert (failing.path / "traceback.txt").read_text().startswith("Traceback")
+    assert whole.state == "done"
+    assert statuses(configs[0]) == ["FAILED", "KILLED", "FAILED", "FINISHED"]
+    artifacts = Path(configs[0].paths.outputs, "artifacts").rglob("traceback.txt")
+    assert [path.read_text() for path in artifacts] == [(failing.path / "traceback.txt").read_text()]
+
+    (failing.path / "checkpoints").unlink()
+    files = {path: path.stat().st_mtime_ns for path in whole.path.rglob("checkpoints/*")}
+    assert sweep(*command).wait(timeout=200) == 0, (tmp_path / "printed.txt").read_text()
+    assert statuses(configs[0]) == ["FINISHED"] * 4
+    assert {path: path.stat().st_mtime_ns for path in whole.path.rglob("checkpoints/*")} == files
+    paths = PathsConfig(outputs=str(tmp_path / "u"))
+    unbroken = dataclasses.replace(tiny(*words, "tracking=none"), paths=paths)
+    train(Job(unbroken))
+    assert fingerprints(configs[0], tmp_path / "o") == fingerprints(unbroken, tmp_path / "u")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["interrupted", "terminated", "killed"])
+def test_the_end_of_a_sweep_commits_its_jobs(sweep: Sweep, seeds: Callable[..., list[Config]], how: str) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the extra joblib is not installed")
+    configs = seeds(*LONG)
+    folders = [RunFolder.of(config) for config in configs]
+    process = sweep(*LONG, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1,2")
+    wait_for(lambda: all(trains(folder) for folder in folders[:2]))
+    if how == "interrupted":
+        os.killpg(process.pid, signal.SIGINT)
+    else:
+        os.kill(process.pid, signal.SIGTERM if how == "terminated" else signal.SIGKILL)
+    assert process.wait(timeout=60) == {"interrupted": 130, "terminated": 143, "killed": -signal.SIGKILL}[how]
+    wait_for(lambda: not any(folder.is_held for folder in folders))
+    assert [folder.state for folder in folders] == ["interrupted", "interrupted", "missing"]
+    assert [folder.status for folder in folders[:2]] == ["KILLED", "KILLED"]
+    if how != "killed":
+        assert statuses(configs[0]) == ["KILLED"] * 3
+
+
+@pytest.mark.slow
+def test_on_a_ray_cluster_of_two_nodes_a_killed_workers_job_is_continued(
+    sweep: Sweep, seeds: Callable[..., list[Config]], tiny: Compose, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("hydra_plugins.hydra_ray_launcher", reason="the extra ray is not installed")
+    for name in ("RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"):
+        monkeypatch.setenv(name, "0")
+    monkeypatch.setenv("RAY_AUTH_TOKEN", "a" * 64)
+    from ray.cluster_utils import Cluster
+
+    node: dict[str, Any] = {"num_cpus": 1, "object_store_memory": 78_643_200}
+    cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
+    try:
+        cluster.add_node(**node)
+        words = (*FREQUENT, "phase.quick.steps=400")
+        configs = seeds(*words)
+        process = sweep(
+            *words, "hydra/launcher=ray", f"hydra.launcher.ray.init.address={cluster.address}", "seed=0,1,2"
+        )
+        killed = RunFolder.of(configs[0])
+        wait_for(lambda: trains(killed))
+        os.kill(holder(killed), signal.SIGKILL)
+        assert process.wait(timeout=250) == 0, (tmp_path / "printed.txt").read_text()
+    finally:
+        cluster.shutdown()
+    assert "continuing run" in (killed.path / "output.txt").read_text()
+    assert statuses(configs[0]) == ["FINISHED"] * 4
+    paths = PathsConfig(outputs=str(tmp_path / "u"))
+    unbroken = dataclasses.replace(tiny(*words, "tracking=none"), paths=paths)
+    train(Job(unbroken))
+    assert fingerprints(configs[0], tmp_path / "o") == fingerprints(unbroken, tmp_path / "u")

@@ -1,0 +1,296 @@
+"""A search with real trainings: in one process, in several, and through every way to end one."""
+
+import dataclasses
+import os
+import shlex
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from atlantis_exp.commands.app import Asked
+from atlantis_exp.commands.overrides import check
+from atlantis_exp.commands.search import SearchConfig, request_of
+from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.runs.journal import Metrics, Tags, read, read_commit
+from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.stopping import StopRequest
+from atlantis_exp.sessions.training import train
+
+pytest.importorskip("optuna", reason="needs pip install 'atlantis-exp[search]'")
+
+from atlantis_exp.sessions.search import Request, _open, _Session, search
+
+REPOSITORY = Path(__file__).parents[2]
+SHORT = ("phase.quick.steps=80", "env.max_steps=20", "evaluation.every_steps=null", "evaluation.episodes=1")
+SPACE = ("optimizer=adam,rmsprop", "optimizer.lr=tag(log, interval(1e-5, 1e-3))")
+
+
+@pytest.fixture
+def searching(tmp_path: Path, tiny_overrides: tuple[str, ...]) -> "Callable[..., Request]":
+    """A search as a command line asks for it: `searching("trials=3", space=SPACE)`."""
+
+    def asked(*overrides: str, space: tuple[str, ...] = SPACE) -> Request:
+        fixed = (*tiny_overrides, *SHORT, f"paths.outputs={tmp_path}", *overrides)
+        ((texts, config),) = check("search", SearchConfig, fixed).items()
+        return request_of(Asked(config, "search", texts, typed=(*fixed, *space)))
+
+    return asked
+
+
+Searching = Callable[..., Request]
+
+
+def rows(outputs: Path, query: str, *values: Any) -> list[tuple[Any, ...]]:
+    with closing(sqlite3.connect(outputs / "mlflow.db")) as database:
+        return database.execute(query, values).fetchall()
+
+
+def session_of(searching: Searching, *overrides: str, space: tuple[str, ...] = SPACE[1:]) -> _Session:
+    return _open(searching(*overrides, space=space))
+
+
+def job_of(session: _Session, number: int) -> Job:
+    values = [f"{key}={value}" for key, value in session.trials[number].params.items()]
+    return session.request.job_of([*session.request.overrides, *values])
+
+
+def test_a_search_trains_its_trials_under_a_run_of_its_own_and_goes_on_where_more_are_asked_for(
+    searching: Searching, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    request = searching("trials=1")
+    search(request)
+    (first,) = tmp_path.glob("runs/*/result.json")
+    trained = first.stat().st_mtime_ns
+    request = dataclasses.replace(request, trials=2)
+    search(request)
+    printed = capsys.readouterr().out
+    assert first.stat().st_mtime_ns == trained
+    assert len(list(tmp_path.glob("runs/*/result.json"))) == 2
+    assert "trial 1: optimizer=" in printed
+    assert f"the best in full: python -m atlantis_exp {request.overrides[0]}" in printed
+
+    session = _open(request)
+    best, other = session.ranking
+    result = RunFolder(tmp_path / "runs" / best.user_attrs["run"]).result
+    assert result is not None
+    assert best.value == result.evaluation["evaluation/mean"] >= (other.value or 0.0)
+    points = [record for _, record in read(session.folder.path) if isinstance(record, Metrics)]
+    assert [point.step for point in points] == [0, 1]
+    assert points[-1].values["search/best"] == best.value
+    artifacts = session.folder.path / "artifacts"
+    assert {path.name for path in artifacts.iterdir()} == {"history.png", "importance.png", "parallel_coordinates.png"}
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in artifacts.iterdir())
+
+    runs = [RunFolder(tmp_path / "runs" / trial.user_attrs["run"]) for trial in (best, other)]
+    assert {run.parent.resolve() for run in runs if run.parent} == {session.folder.path}
+    tags = [record.values for _, record in read(runs[0].path) if isinstance(record, Tags)]
+    (command,) = [values["command"] for values in tags if "command" in values]
+    assert command.endswith(f"optimizer={best.params['optimizer']} optimizer.lr={best.params['optimizer.lr']}")
+    page = read_commit(session.folder.path)
+    assert page is not None
+    assert page.status == "FINISHED"
+
+
+def test_a_trial_that_nobody_holds_goes_on_before_a_new_one_is_drawn(searching: Searching) -> None:
+    session = session_of(searching, "trials=3")
+    with session.claimed() as left:
+        pass
+    with open(session.folder.path / "trials.jsonl", "ab") as file:
+        file.write(b'{"op_code":4,"work')  # a line that the process was killed in
+    other = _open(session.request)
+    with other.claimed() as trial, session.claimed() as new:
+        assert left is not None
+        assert trial is not None
+        assert new is not None
+        assert (trial.number, trial.params) == (left.number, left.params)
+        assert new.number == 1
+        assert new.params != trial.params
+
+
+def test_what_is_drawn_depends_on_the_number_of_the_trial_and_those_before_alone(searching: Searching) -> None:
+    request, drawn = searching(space=SPACE[1:]), []
+    for name in ("a", "b"):
+        session = _open(dataclasses.replace(request, name=name))
+        with session.claimed() as first, session.claimed() as second:
+            assert first is not None
+            assert second is not None
+            drawn.append((first.params, second.params))
+    assert drawn[0] == drawn[1]
+    assert drawn[0][0] != drawn[0][1]
+
+
+def test_values_that_are_under_way_are_not_trained_twice(searching: Searching) -> None:
+    session = session_of(searching, "trials=2", space=("optimizer=choice(adam)",))
+    with session.claimed(), session.claimed() as again:
+        assert again is not None
+        session.train(again, StopRequest())
+    assert session.trials[1].state.name == "FAIL"
+    assert "trial 0, which is under way, has the same values" in session.trials[1].user_attrs["error"]
+
+
+@pytest.mark.slow
+def test_a_trial_below_the_median_is_committed_and_can_be_trained_to_its_end(searching: Searching) -> None:
+    session = session_of(
+        searching, "trials=2", "evaluation.every_steps=40", "pruning.trials=1", "pruning.evaluations=0"
+    )
+    with session.claimed() as good:
+        assert good is not None
+        good.report(1e6, 1)
+        session.study.tell(good.number, 1e6)
+    with session.claimed() as trial:
+        assert trial is not None
+        session.train(trial, StopRequest())
+    pruned = session.trials[1]
+    assert pruned.state.name == "PRUNED"
+    assert list(pruned.intermediate_values) == [1]
+    job = job_of(session, 1)
+    folder = RunFolder.of(job.config)
+    assert folder.state == "interrupted"
+    tags = {
+        key: value
+        for _, record in read(folder.path)
+        if isinstance(record, Tags)
+        for key, value in record.values.items()
+    }
+    assert tags["pruned"] == f"trial 1 of {session.folder.name}, at step 40"
+    train(job)
+    assert folder.result is not None
+    assert [number for number, value in enumerate(session.trials) if value.state.name == "COMPLETE"] == [0]
+
+
+@pytest.mark.slow
+def test_a_trial_that_fails_is_recorded_and_the_search_goes_on(
+    searching: Searching, capsys: pytest.CaptureFixture[str]
+) -> None:
+    request = searching("trials=3", space=("optimizer.lr=1e-4,1e30",))  # the larger one diverges
+    search(request)
+    session = _open(request)
+    states = {(trial.params["optimizer.lr"], trial.state.name) for trial in session.trials}
+    assert states == {("0.0001", "COMPLETE"), ("1e+30", "FAIL")}
+    assert "no finite number" in capsys.readouterr().out
+
+
+def test_a_search_without_a_trial_that_was_trained_to_its_end_says_so(searching: Searching) -> None:
+    with pytest.raises(Fault, match="no trial was trained to its end; 0 of 20 trials"):
+        session_of(searching).print_results()
+
+
+def test_a_run_that_went_on_beyond_the_budget_is_no_result_of_a_search_within_it(searching: Searching) -> None:
+    session = session_of(searching, "budget.steps=40", space=("optimizer=choice(adam)",))
+    with session.claimed() as trial:
+        assert trial is not None
+        config = job_of(session, 0).config
+        train(Job(dataclasses.replace(config, budget=dataclasses.replace(config.budget, steps=None))))
+        session.train(trial, StopRequest())
+    assert "was trained for 80 steps already" in session.trials[0].user_attrs["error"]
+    with session.claimed() as trial:
+        assert trial is not None
+        session.study.tell(trial.number, 1.0)
+    assert "budget.steps" not in session.best_command()
+    assert session.best_command().endswith("optimizer=adam")
+
+
+def test_a_name_is_one_searchs(searching: Searching) -> None:
+    session_of(searching, "name=mine", space=("optimizer=choice(adam)",))
+    with pytest.raises(ConfigError, match="name=mine: was begun for another space or another training"):
+        session_of(searching, "name=mine", "env.size=48", space=("optimizer=choice(adam)",))
+
+
+@pytest.mark.slow
+def test_at_the_end_of_its_time_a_search_leaves_its_trial_to_be_continued(searching: Searching, tmp_path: Path) -> None:
+    for seconds in (2, 8, 32):  # which can be over before a first trial, where other programs want the machine
+        request = searching(f"budget.wall_clock={seconds}s", "phase.quick.steps=100_000")
+        with pytest.raises(
+            Fault, match="the search goes on with: python -m atlantis_exp search experiment=quick"
+        ) as caught:
+            search(request)
+        assert caught.value.exit_code == 124
+        session = _open(request)
+        if session.trials:
+            break
+    assert [trial.state.name for trial in session.trials] == ["RUNNING"]
+    assert RunFolder(tmp_path / "runs" / session.trials[0].user_attrs["run"]).state == "interrupted"
+    commit = read_commit(session.folder.path)
+    assert commit is not None
+    assert commit.status == "KILLED"
+
+
+def started(request: Request) -> "subprocess.Popen[str]":
+    """A process of the command that a search says it goes on with."""
+    return subprocess.Popen(
+        (sys.executable, *shlex.split(request.command)[1:]),
+        cwd=REPOSITORY,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    patience = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < patience
+        time.sleep(0.02)
+
+
+LONG = ("phase.quick.steps=1_500", "tracking.commit_seconds=0.2", "trials=2")
+
+
+@pytest.mark.slow
+def test_a_search_that_is_interrupted_and_killed_is_the_unbroken_one(searching: Searching, tmp_path: Path) -> None:
+    def results(session: _Session) -> list[Any]:
+        return [(trial.number, trial.state, trial.params, trial.value) for trial in session.trials]
+
+    request = searching(*LONG, f"paths.outputs={tmp_path}/unbroken")
+    search(request)
+    unbroken = _open(request)
+
+    request = searching(*LONG, f"paths.outputs={tmp_path}/broken")
+    for number in (signal.SIGINT, signal.SIGKILL):
+        before = len(list(tmp_path.glob("broken/runs/*/checkpoints/*/manifest.json")))
+        process = started(request)
+        wait_for(
+            lambda before=before: len(list(tmp_path.glob("broken/runs/*/checkpoints/*/manifest.json"))) > before  # type: ignore[misc]
+        )
+        process.send_signal(number)
+        _, errors = process.communicate()
+        assert process.returncode == (130 if number == signal.SIGINT else -9)
+        if number == signal.SIGINT:
+            assert "the search goes on with: python -m atlantis_exp search" in errors
+    process = started(request)
+    out, errors = process.communicate()
+    assert process.returncode == 0, errors
+    assert "continuing run" in out
+    assert results(_open(request)) == results(unbroken)
+    assert len(list(tmp_path.glob("broken/runs/*"))) == 2
+
+
+@pytest.mark.slow
+def test_several_processes_share_a_search_and_end_together(searching: Searching, tmp_path: Path) -> None:
+    request = searching("trials=4", "tracking=mlflow", "tracking.every_steps=20", "phase.quick.steps=600")
+    processes = [started(request), started(request)]
+    outputs = [process.communicate() for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], outputs
+    assert all("the best in full" in out for out, _ in outputs)
+    session = _open(request)
+    assert [trial.state.name for trial in session.trials] == ["COMPLETE"] * 4
+    assert len({trial.user_attrs["run"] for trial in session.trials}) == len(list(tmp_path.glob("runs/*"))) == 4
+    trained = ["starting run" in out for out, _ in outputs]
+    assert trained == [True, True]
+    stored = dict(rows(tmp_path, "SELECT name, run_uuid FROM runs"))
+    assert len(stored) == 5
+    parent = stored.pop("search optimizer optimizer.lr")
+    assert rows(tmp_path, "SELECT status FROM runs WHERE run_uuid = ?", parent) == [("FINISHED",)]
+    assert rows(tmp_path, "SELECT COUNT(*) FROM metrics WHERE key = 'search/mean' AND run_uuid = ?", parent) == [(4,)]
+    children = rows(tmp_path, "SELECT run_uuid FROM tags WHERE key = 'mlflow.parentRunId' AND value = ?", parent)
+    assert {child for (child,) in children} == set(stored.values())

@@ -1,0 +1,162 @@
+"""The MLflow UI as a person sees it: in a real browser, on a small sweep.
+
+The browser is the system's chromium or the one that playwright has installed; without either the tests are skipped.
+"""
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.config import Config
+from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.sweep import ledger
+from atlantis_exp.sessions.training import train
+from atlantis_exp.tracking.store import Store
+
+REPOSITORY = Path(__file__).parents[2]
+pytestmark = pytest.mark.slow
+COMMAND = (sys.executable, "-m", "atlantis_exp", "ui")
+SECONDS = 60_000  # that a page may take, in ms
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Any]:
+    """A page in a browser; any type, since playwright need not be there."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    browser_file = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    with playwright.sync_playwright() as started:
+        try:
+            browser = started.chromium.launch(executable_path=browser_file, args=["--no-sandbox"])
+        except playwright.Error as error:
+            pytest.skip(f"there is no browser: {str(error).splitlines()[0]}")
+        context = browser.new_context(viewport={"width": 1600, "height": 2400})
+        context.set_default_timeout(SECONDS)
+        yield context.new_page()
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def outputs(page: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: ARG001  no browser, no sweep
+    """A sweep of two seeds, with films."""
+    folder = tmp_path_factory.mktemp("outputs")
+    overrides = (
+        *("experiment=quick", "device=cpu", "threads=1", "tracking.every_steps=20", "budget.forecast=off"),
+        *("env.size=40", "env.max_steps=40", "phase.quick.steps=160", "replay.capacity=120"),
+        *("training.learn_start=20", "training.learn_every=4", "training.batch_size=4", "training.precision=fp32"),
+        *("evaluation.episodes=2", "evaluation.num_envs=1", "evaluation.every_steps=80", f"paths.outputs={folder}"),
+    )
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        configs = [checked(Config, compose("config", [*overrides, f"seed={seed}"])) for seed in (0, 1)]
+    jobs = [Job(config, ("quick",)) for config in configs]
+    with ledger(jobs, ["seed=0,1"]):
+        for job in jobs:
+            train(job)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def address(outputs: Path, free_port: Callable[[], int], answering: Callable[..., None]) -> Iterator[str]:
+    """What the command prints, once the server answers."""
+    port = free_port()
+    server = subprocess.Popen(
+        (*COMMAND, f"port={port}", f"paths.outputs={outputs}"),
+        cwd=REPOSITORY,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,  # it has a process that serves
+    )
+    assert server.stdout is not None
+    shown = server.stdout.readline().split()[-1]
+    answering(server, port)
+    yield shown
+    os.killpg(server.pid, signal.SIGKILL)
+    server.wait()
+
+
+@pytest.fixture
+def run_id(outputs: Path) -> Callable[[str], str]:
+    """The id of the run whose name starts so."""
+    runs = Store(outputs).runs()
+    return lambda start: min(run.run_id for run in runs if run.name.startswith(start))
+
+
+def size_of(image: Any) -> list[int]:
+    image.evaluate("image => image.decode()")
+    size: list[int] = image.evaluate("image => [image.naturalWidth, image.naturalHeight]")
+    return size
+
+
+def test_the_address_opens_on_charts_of_every_run_and_pictures_with_a_slider(page: Any, address: str) -> None:
+    page.goto(address)
+    page.get_by_text("cnn uniform s0 quick").first.wait_for()
+    curves = page.locator(".js-plotly-plot .scatterlayer .trace")
+    curves.first.wait_for()
+    page.wait_for_function("document.querySelectorAll('.js-plotly-plot .scatterlayer .trace').length >= 4")
+    assert re.search(r"score\s*\(6\)", page.inner_text("body"))
+    picture = page.locator("img[src*='score~histogram']").first
+    picture.wait_for()
+    assert size_of(picture) == [256, 256]
+    slider = page.get_by_role("slider").first
+    before = picture.get_attribute("src")
+    slider.focus()
+    slider.press("ArrowRight")
+    page.wait_for_function(
+        "before => document.querySelector(\"img[src*='score~histogram']\")?.getAttribute('src') != before", arg=before
+    )
+
+
+def test_the_sweep_view_has_a_curve_a_group(page: Any, address: str) -> None:
+    page.goto("about:blank")  # else only the part behind '#' changes, and the application begins with the old view
+    page.goto(address.replace("=start", "=sweep"))
+    page.get_by_text("Group: cnn uniform quick").first.wait_for()
+    page.locator(".js-plotly-plot .scatterlayer .trace").first.wait_for()
+    assert page.get_by_text("cnn uniform quick").count() > 1  # the legends' as well
+
+
+def test_the_film_plays_inside_its_run(page: Any, address: str, run_id: Callable[[str], str]) -> None:
+    runs = address.partition("?")[0]
+    page.goto(f"{runs}/{run_id('cnn')}/artifacts/best_episode.mp4")
+    film = page.locator("video")
+    film.wait_for()
+    page.wait_for_function("document.querySelector('video').readyState >= 2")
+    assert film.evaluate("film => [film.videoWidth, film.videoHeight]") == [560, 420]
+    film.evaluate("film => { film.muted = true; return film.play() }")
+    page.wait_for_function("document.querySelector('video').currentTime > 0")
+
+
+def test_the_pages_of_a_run_and_of_a_sweep_begin_with_their_results(
+    page: Any, address: str, run_id: Callable[[str], str]
+) -> None:
+    runs = address.partition("?")[0]
+    page.goto(f"{runs}/{run_id('cnn')}")
+    page.get_by_text("The best mean so far is").wait_for()
+    page.goto(f"{runs}/{run_id('sweep')}")
+    page.get_by_text("mean of the means").first.wait_for()
+    page.goto(f"{runs}/{run_id('sweep')}/model-metrics")
+    figure = page.locator("img[src*='sweep~curves']").first
+    figure.wait_for()
+    assert size_of(figure)[0] > 100
+
+
+def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", 0))
+        held.listen()
+        port = held.getsockname()[1]
+        command = (*COMMAND, f"port={port}", f"paths.outputs={tmp_path}")
+        ended = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert ended.stderr == f"atlantis_exp: port={port}: Address already in use; choose another, as in port=5001\n"
+    assert not list(tmp_path.iterdir())

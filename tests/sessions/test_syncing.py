@@ -1,0 +1,324 @@
+"""Run folders that go to a real MLflow server and come back, into a real store of another outputs folder."""
+
+import gzip
+import io
+import signal
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, closing
+from pathlib import Path
+from typing import Any
+
+import PIL.Image
+import pytest
+from hydra import compose, initialize_config_dir
+
+from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.commands.sync import SyncConfig
+from atlantis_exp.faults import Fault
+from atlantis_exp.runs.folder import Result, RunFolder
+from atlantis_exp.runs.journal import Commit, Journal, adopt, commit_bytes, read_commit, write_file
+from atlantis_exp.sessions.syncing import sync
+from atlantis_exp.tracking import travel
+from atlantis_exp.tracking.publishing import catch_up
+from atlantis_exp.tracking.store import Store, files_digest, publish, unfinished
+
+REPOSITORY = Path(__file__).parents[2]
+Served = Callable[[Path, int], AbstractContextManager[None]]
+
+
+@pytest.fixture(scope="module")
+def server(
+    tmp_path_factory: pytest.TempPathFactory, free_port: Callable[[], int], mlflow_server: Served
+) -> Iterator[tuple[str, Path]]:
+    """A server's address and the folder of its database and files."""
+    folder, port = tmp_path_factory.mktemp("server"), free_port()
+    with mlflow_server(folder, port):
+        yield f"http://127.0.0.1:{port}", folder
+
+
+def synced(outputs: Path, *overrides: str) -> None:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = checked(SyncConfig, compose("sync", [f"paths.outputs={outputs}", *overrides]))
+    sync(**vars(config), seconds=config.seconds)
+
+
+def png(grey: int) -> bytes:
+    content = io.BytesIO()
+    PIL.Image.new("L", (8, 4), grey).save(content, "PNG", compress_level=0)  # other bytes than MLflow would write
+    return content.getvalue()
+
+
+def grow(journal: Journal, start: int) -> None:
+    """Add five steps of everything that a journal can hold, and commit."""
+    for step in range(start, start + 5):
+        journal.metrics({"score/mean_100": step, "learning/loss": float("nan") if step == 2 else step / 7}, step)
+    journal.tags({"mlflow.note.content": f"at step {start}"})
+    journal.image("score/histogram", png(start), start)
+    journal.model("network", bytes([start]), start + 4, {"score/mean_100": start + 4}, best=True)
+    journal.artifact("evaluation/report.txt", f"report {start}".encode())
+    journal.state_dict()
+    journal.commit()
+
+
+def a_sweep_of_one(outputs: Path, name: str) -> Path:
+    """Write the folders of a finished run and its sweep, as commands do; returns the run's."""
+    run, parent = RunFolder(outputs / "runs" / name), RunFolder(outputs / "sweeps" / f"sweep-{name}")
+    page = Journal(parent.path, {"mlflow.runName": f"sweep {name}"})
+    page.artifact("runs.csv", b"run\n")
+    page.state_dict()
+    page.commit()
+    page.status("FINISHED")
+    journal = Journal(run.path, {"mlflow.runName": name})
+    run.write_config({"seed": 0})
+    journal.params({"seed": "0"})
+    grow(journal, 0)
+    journal.status("FINISHED")
+    run.write_result(Result("finished", 5, {}, {}, ""))
+    (run.path / "checkpoints").mkdir()
+    (run.path / "checkpoints" / "memory").write_bytes(b"large")
+    adopt(run.path, parent.path)
+    return run.path
+
+
+def contents(outputs: Path) -> dict[str, bytes]:
+    """The files of all run folders but checkpoints, locks and what MLflow was sent."""
+    files = (path for path in outputs.glob("*/*/**/*") if path.is_file() and "checkpoints" not in path.parts)
+    named = {str(path.relative_to(outputs)): path.read_bytes() for path in files}
+    return {
+        name: content
+        for name, content in named.items()
+        if not name.startswith("artifacts/")
+        and not name.split("/")[2].startswith(("published", "origin", "lock", "holder"))
+    }
+
+
+def rows(folder: Path, query: str, *values: Any) -> list[tuple[Any, ...]]:
+    with closing(sqlite3.connect(folder / "mlflow.db")) as database:
+        return database.execute(query, values).fetchall()
+
+
+def shown(root: Path, run: str) -> dict[str, Any]:
+    """What a database says of the run of that name, its ids and places left out."""
+    [(run_id, status, started)] = rows(
+        root, "SELECT run_uuid, status, start_time FROM runs WHERE name = ? AND lifecycle_stage = 'active'", run
+    )
+    metrics = rows(root, "SELECT key, step, timestamp, value, is_nan FROM metrics WHERE run_uuid = ?", run_id)
+    tags = dict(rows(root, "SELECT key, value FROM tags WHERE run_uuid = ?", run_id))
+    parent = rows(root, "SELECT name FROM runs WHERE run_uuid = ?", tags.pop("mlflow.parentRunId", None))
+    models = rows(root, "SELECT model_id, name FROM logged_models WHERE source_run_id = ?", run_id)
+    model_tags = "SELECT tag_key, tag_value FROM logged_model_tags WHERE model_id = ? AND tag_key IN ('step', 'best')"
+    model_metrics = "SELECT metric_name, metric_step, metric_value FROM logged_model_metrics WHERE model_id = ?"
+    return {
+        "run": (status, started, parent),
+        "metrics": sorted(metrics),
+        "params": sorted(rows(root, "SELECT key, value FROM params WHERE run_uuid = ?", run_id)),
+        "tags": {key: value for key, value in tags.items() if key not in ("atlantis.folder", "atlantis.standing")},
+        "models": sorted(
+            (name, sorted(rows(root, model_tags, model)), rows(root, model_metrics, model)) for model, name in models
+        ),
+    }
+
+
+def test_runs_go_to_a_server_and_come_back_equal_and_once_and_then_what_is_new(
+    tmp_path: Path, server: tuple[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (address, behind), cluster, laptop = server, tmp_path / "cluster", tmp_path / "laptop"
+    run = a_sweep_of_one(cluster, "whole")
+    synced(cluster)
+    for _ in range(2):
+        synced(cluster, f"to={address}")
+    for _ in range(2):
+        synced(laptop, f"from={address}")
+    here, there = f"to sqlite:///{laptop}/mlflow.db: 2 runs:", f"{address}: 2 runs:"
+    both, printed = ["  published   sweeps/sweep-whole", "  published   runs/whole"], capsys.readouterr()
+    assert printed.err == ""
+    assert printed.out.splitlines() == [
+        *(*both, f"to sqlite:///{cluster}/mlflow.db: 2 runs: 2 published"),
+        *(*both, f"to {there} 2 published", f"to {there} 2 up to date"),
+        *("  brought     sweeps/sweep-whole", "  brought     runs/whole", f"from {there} 2 brought"),
+        *(*both, f"{here} 2 published", f"from {there} 2 as here", f"{here} 2 up to date"),
+    ]
+    assert contents(laptop) == contents(cluster)
+    for name in ("whole", "sweep whole"):
+        assert shown(behind, name) == shown(laptop, name) == shown(cluster, name)
+    assert len(shown(behind, "whole")["metrics"]) == 10
+
+    journal = Journal(run)
+    commit = read_commit(run)
+    assert commit is not None
+    journal.load_state_dict({"offset": commit.offset, "time": commit.updated})
+    grow(journal, 5)
+    synced(cluster)
+    synced(cluster, f"to={address}")
+    synced(laptop, f"from={address}")
+    assert contents(laptop) == contents(cluster)
+    assert shown(behind, "whole") == shown(laptop, "whole") == shown(cluster, "whole")
+    assert len(shown(behind, "whole")["metrics"]) == 20
+    sent = sorted(path.name for path in behind.glob("artifacts/*/*/artifacts/run_folder/journal/*") if commit.offset)
+    assert sent.count(f"{commit.offset:012d}.gz") == 1
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_where_it_is_and_its_copy_is_nobodys_to_end_or_replace(
+    tmp_path: Path, server: tuple[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (address, behind), cluster, laptop = server, tmp_path / "cluster", tmp_path / "laptop"
+    run = a_sweep_of_one(cluster, "moving")
+    Journal(run).status("RUNNING")
+    (run / "result.json").unlink()
+    synced(cluster, f"to={address}", "tracking.experiment=moving")
+    origin = f"from={address}"
+    synced(laptop, origin, "tracking.experiment=moving")
+    catch_up(laptop)
+    copy = laptop / "runs/moving"
+    assert (copy / "commit.json").read_bytes() == (run / "commit.json").read_bytes()
+
+    with RunFolder(copy).held():  # it was continued there, say
+        Journal(run).status("FINISHED")
+        synced(cluster, f"to={address}", "tracking.experiment=moving")
+        synced(laptop, origin, "tracking.experiment=moving")
+    assert "held by process" in capsys.readouterr().err
+    assert RunFolder(copy).status == "RUNNING"
+    synced(laptop, origin, "tracking.experiment=moving")
+    assert RunFolder(copy).status == "FINISHED"
+
+    began_anew = Journal(copy)  # without a checkpoint: another history
+    began_anew.metrics({"score/mean_100": 1.0}, 1)
+    began_anew.state_dict()
+    began_anew.commit()
+    kept = contents(laptop)
+    synced(laptop, origin, "tracking.experiment=moving")
+    assert "is another run, which stays" in capsys.readouterr().err
+    assert contents(laptop) == kept
+    synced(laptop, f"to={address}", "tracking.experiment=moving")
+    names = "SELECT status, lifecycle_stage FROM runs WHERE name = 'moving' ORDER BY status"
+    assert rows(behind, names) == [("FINISHED", "active"), ("FINISHED", "active")]
+
+
+@pytest.mark.slow
+def test_a_copy_follows_a_run_that_went_back_behind_what_was_sent(tmp_path: Path, server: tuple[str, Path]) -> None:
+    (address, behind), cluster, laptop = server, tmp_path / "cluster", tmp_path / "laptop"
+    options = (f"from={address}", "tracking.experiment=back")
+    run = a_sweep_of_one(cluster, "back")
+    synced(cluster, f"to={address}", "tracking.experiment=back")
+    synced(laptop, *options)
+    journal = Journal(run)
+    grow(journal, 7)
+    synced(cluster, f"to={address}", "tracking.experiment=back")
+    synced(laptop, *options)
+    assert {name: content for name, content in contents(laptop).items() if "artifacts" not in name} == {
+        name: content for name, content in contents(cluster).items() if "artifacts" not in name
+    }
+    assert shown(behind, "back") == shown(laptop, "back")
+
+
+@pytest.mark.slow
+def test_a_bringing_that_breaks_off_anywhere_is_made_good(
+    tmp_path: Path, server: tuple[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (address, _), cluster, laptop = server, tmp_path / "cluster", tmp_path / "laptop"
+    options = (f"from={address}", "tracking.experiment=broken")
+    run = a_sweep_of_one(cluster, "broken")
+    synced(cluster, f"to={address}", "tracking.experiment=broken")
+    attempts = 0
+    for fails_at in range(20):
+        attempts, writes = attempts + 1, iter(range(20))
+
+        def write_or_fail(path: Path, content: bytes, fails_at: int = fails_at, writes: Iterator[int] = writes) -> None:
+            if next(writes) >= fails_at:
+                raise ValueError(f"no {path}")
+            write_file(path, content)
+
+        monkeypatch.setattr(travel, "write_file", write_or_fail)
+        try:
+            synced(laptop, *options)
+            break
+        except Fault:
+            assert read_commit(laptop / "runs/broken") in (None, read_commit(run))
+    assert attempts == 7  # the sweep has a file and its commit, the run three, config, result and commit
+    assert contents(laptop) == contents(cluster)
+
+
+def test_what_a_server_says_leads_nowhere_outside(
+    tmp_path: Path, server: tuple[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    laptop = tmp_path / "laptop"
+    store = Store(tmp_path, "forged", server[0])
+    line = b'{"kind":"artifact","path":"%s"}\n'
+
+    def forge(folder: str, parent: str = "", path: bytes = b"a.txt") -> None:
+        """Make a run on the server as if a folder had been published."""
+        journal = line % path
+        files = {"commit.json": commit_bytes(Commit("x", 1, 2, len(journal), "FINISHED", parent=parent))}
+        run = store.client.create_run(store.experiment_id, tags={"atlantis.folder": folder}).info.run_id
+        for name, content in {**files, "journal/000000000000.gz": gzip.compress(journal)}.items():
+            (aside := tmp_path / Path(name).name).write_bytes(content)
+            store.client.log_artifact(run, str(aside), str(Path("run_folder", name).parent))
+        store.client.set_tag(run, "atlantis.standing", files_digest(files))
+
+    forge("/home/x/runs/../..")
+    forge("/home/x/runs/a b")
+    forge("/home/x/artifacts/atlantis")
+    forge("/home/x/runs/own", parent="../../runs/own")
+    forge("/home/x/runs/far", parent="../../../etc/passwd")
+    forge("/home/x/runs/path", path=b"../../../away")
+    forge("/home/x/runs/absolute", path=b"/tmp/away")
+    forge("/home/x/runs/fine")
+    with pytest.raises(Fault, match="7 of 8 runs failed"):
+        synced(laptop, f"from={server[0]}", "tracking.experiment=forged")
+    said = capsys.readouterr().err
+    assert said.count("no run folder's place") == 4
+    assert said.count("does not name a file inside") == 2
+    assert said.count("its own parent") == 1
+    assert "runs/fine/commit.json" in contents(laptop)
+    assert not list(tmp_path.rglob("away"))
+    assert {path.name for path in laptop.iterdir()} == {"runs", "mlflow.lock"}
+
+
+def test_every_folder_of_the_outputs_is_published_and_stays_at_home(tmp_path: Path) -> None:
+    a_sweep_of_one(tmp_path, "plain")
+    away = a_sweep_of_one(tmp_path, "away")
+    with pytest.raises(Exception, match="refused"):
+        publish(away, Store(tmp_path, tracking_uri="http://127.0.0.1:9"))
+    synced(tmp_path)
+    assert rows(tmp_path, "SELECT count(*) FROM runs") == [(4,)]
+    lacking = unfinished(away, tmp_path)
+    assert lacking is not None
+    assert lacking.uri == "http://127.0.0.1:9"
+    assert unfinished(tmp_path / "runs/plain", tmp_path) is None
+
+
+@pytest.mark.slow
+def test_it_goes_on_looking_until_it_is_interrupted(tmp_path: Path) -> None:
+    command = (sys.executable, "-m", "atlantis_exp", "sync", "every=1s", f"paths.outputs={tmp_path}")
+    looking = subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert looking.stdout is not None
+        assert looking.stdout.readline().endswith("mlflow.db: 0 runs\n")
+        a_sweep_of_one(tmp_path, "late")
+        seen: set[str] = set()
+        while not {"  published   runs/late\n", "  published   sweeps/sweep-late\n"} <= seen:
+            seen.add(line := looking.stdout.readline())
+            assert line
+        looking.send_signal(signal.SIGINT)
+        _, error = looking.communicate(timeout=60)
+        assert (looking.returncode, error) == (130, "")
+    finally:
+        looking.kill()
+        looking.wait()
+
+
+@pytest.mark.slow
+def test_a_server_out_of_reach_and_a_damaged_folder_are_one_line_each(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a_sweep_of_one(tmp_path, "plain")
+    with pytest.raises(Fault, match=r"^http://127.0.0.1:9 cannot be reached: .*refused"):
+        synced(tmp_path, "to=http://127.0.0.1:9")
+    (tmp_path / "runs/plain/commit.json").write_text("{")
+    with pytest.raises(Fault, match="1 of 2 runs failed"):
+        synced(tmp_path)
+    assert "commit.json is damaged" in capsys.readouterr().err

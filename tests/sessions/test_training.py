@@ -1,0 +1,489 @@
+import dataclasses
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from atlantis_exp.checking import parse, to_dict
+from atlantis_exp.commands.overrides import read_override
+from atlantis_exp.commands.train import VERB
+from atlantis_exp.config import Config, PathsConfig
+from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.runs.journal import Artifact, Image, Journal, Metrics, Model, read
+from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.training import train
+from atlantis_exp.sessions.verifying import fingerprints, train_and_kill
+from atlantis_exp.tracking.publishing import catch_up
+from atlantis_exp.tracking.store import Store, publish
+from atlantis_exp.training.checkpoint import Checkpoints
+from atlantis_exp.training.forecast import Forecast
+from atlantis_exp.training.trainer import Trainer
+
+Compose = Callable[..., Config]
+Served = Callable[[Path, int], AbstractContextManager[None]]
+REPOSITORY = Path(__file__).parents[2]
+COMMAND = (sys.executable, "-m", "atlantis_exp")
+SHORT = ("phase.quick.steps=40", "evaluation.at_end=false", "evaluation.every_steps=null")
+LONG = ("phase.quick.steps=100_000", "evaluation.every_steps=null", "tracking.commit_seconds=0.2")
+
+
+def test_the_forecast_is_measured_before_there_is_anything_for_mlflow(
+    tiny: Compose, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = tiny(*SHORT, "tracking=mlflow", "budget.forecast=warn")
+    folder, seen = RunFolder.of(config), []
+
+    def measured(_: Trainer, *, steps_done: int, **__: float) -> Forecast:
+        time.sleep(0.5)  # for a publisher that would begin
+        seen.append((folder.state, folder.status, (tmp_path / "mlflow.lock").exists(), steps_done))
+        return Forecast(1, 40, 0, 1, 0, 1)
+
+    monkeypatch.setattr("atlantis_exp.sessions.training.forecast", measured)
+    train(Job(config))
+    assert seen == [("running", None, False, 0)]
+    assert folder.state == "done"
+
+
+def test_a_forecast_changes_nothing_of_a_training(tiny: Compose, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[float] = []
+
+    def timed(call: Callable[[], object], at_least: int, seconds: float) -> float:
+        for _ in range(at_least):
+            call()
+        calls.append(seconds)
+        return 0.001
+
+    monkeypatch.setattr("atlantis_exp.training.forecast._median_seconds", timed)
+    for steps in ("28", "null"):  # the second one amid an episode, and after updates
+        config = tiny(*SHORT, "budget.forecast=warn", f"budget.steps={steps}")
+        train(Job(config))
+    unbroken = at(tiny(*SHORT), Path(config.paths.outputs, "u"))
+    train(Job(unbroken))
+    assert len(calls) == 2 * 3
+    assert fingerprints(config, Path(config.paths.outputs)) == fingerprints(unbroken, Path(unbroken.paths.outputs))
+
+
+def at(config: Config, outputs: Path) -> Config:
+    """A training under another folder."""
+    return dataclasses.replace(config, paths=PathsConfig(outputs=str(outputs)))
+
+
+def session(config: Config, tiny_overrides: tuple[str, ...], *overrides: str, **environment: str) -> Any:
+    """A training in a process of its own."""
+    return subprocess.Popen(
+        (*COMMAND, "train", *tiny_overrides, f"paths.outputs={config.paths.outputs}", *overrides),
+        cwd=REPOSITORY,
+        env={**os.environ, **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def generation(folder: RunFolder) -> int:
+    return max((int(path.parent.name) for path in folder.path.glob("checkpoints/0*/manifest.json")), default=0)
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    patience = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < patience
+        time.sleep(0.02)
+
+
+def test_a_run_that_has_ended_is_reported_and_not_trained_again(
+    tiny: Compose, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tiny("evaluation.every_steps=null")
+    train(Job(config))
+    folder = RunFolder.of(config)
+    files = {path: path.stat().st_mtime_ns for path in folder.path.rglob("*")}
+    capsys.readouterr()
+    train(Job(config))
+    assert f"run {folder.name} has ended (finished after 160 steps)" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in folder.path.rglob("*")} == files
+    assert folder.state == "done"
+
+
+def test_a_larger_budget_continues_a_run_that_its_budget_ended(tiny: Compose) -> None:
+    for steps in ("80", "120", "null"):
+        config = tiny(f"budget.steps={steps}", "evaluation.at_end=false", "evaluation.every_steps=null")
+        train(Job(config))
+    result = RunFolder.of(config).result
+    assert result is not None
+    assert (result.outcome, result.steps) == ("finished", 160)
+    unbroken = at(config, Path(config.paths.outputs, "u"))
+    train(Job(unbroken))
+    assert fingerprints(config, Path(config.paths.outputs)) == fingerprints(unbroken, Path(unbroken.paths.outputs))
+
+
+@pytest.mark.parametrize(
+    ("name", "damaged"),
+    [
+        ("result.json", ""),
+        ("result.json", "[1]"),
+        ("result.json", '{"outcome": "finished", "steps": "many", "counts": {}, "evaluation": {}, "report": ""}'),
+        ("commit.json", '{"identity": "a", "started": 1, "updated": 1, "offset": 0'),
+        ("commit.json", '{"identity": "a", "started": 1, "updated": 1, "offset": "0", "status": "RUNNING"}'),
+    ],
+)
+def test_a_damaged_file_of_a_run_is_one_clear_line_and_is_written_anew_once_it_is_removed(
+    tiny: Compose, name: str, damaged: str
+) -> None:
+    config = tiny(*SHORT, "budget.steps=20")
+    train(Job(config))
+    folder = RunFolder.of(config)
+    path = folder.path / name
+    whole = json.loads(path.read_bytes())
+    path.write_text(damaged)
+    with pytest.raises(Fault, match=f"{path} is damaged: remove it and issue the run's command again"):
+        train(Job(tiny(*SHORT)))
+    path.unlink()
+    train(Job(tiny(*SHORT)))
+    assert json.loads(path.read_bytes()).keys() == whole.keys()
+    assert folder.state == "done"
+
+
+def test_a_damaged_run_is_no_obstacle_to_another(tiny: Compose, capsys: pytest.CaptureFixture[str]) -> None:
+    damaged = tiny(*SHORT).paths.outputs + "/runs/damaged/commit.json"
+    Path(damaged).parent.mkdir(parents=True)
+    Path(damaged).write_text("{")
+    train(Job(tiny(*SHORT)))
+    assert capsys.readouterr().err.startswith(f"atlantis_exp: {damaged} is damaged")
+
+
+def test_a_config_that_was_lost_is_written_again(tiny: Compose) -> None:
+    config = tiny(*SHORT)
+    train(Job(config))
+    (RunFolder.of(config).path / "config.json").unlink()
+    assert str(RunFolder.of(config).state) == "missing"
+    train(Job(config))
+    assert RunFolder.of(config).config == to_dict(config)
+    assert RunFolder.of(config).state == "done"
+
+
+def test_resume_must_refuses_to_start_and_resume_never_keeps_what_was_there(tiny: Compose) -> None:
+    with pytest.raises(ConfigError, match="resume=must: there is no run"):
+        train(Job(tiny(*SHORT, "resume=must")))
+    for resume in ("auto", "must", "never"):
+        config = tiny(*SHORT, f"resume={resume}")
+        train(Job(config))
+    names = sorted(path.name for path in RunFolder.of(config).path.parent.iterdir())
+    assert names == [config.run_name(), f"{config.run_name()}~1"]
+
+
+def test_a_run_that_another_process_holds_is_not_touched(tiny: Compose) -> None:
+    config = tiny()
+    folder = RunFolder.of(config)
+    holder = f"process {os.getpid()} on {os.uname().nodename}"
+    with folder.held(), pytest.raises(Fault, match=f"run {folder.name} is held by {holder}") as fault:
+        train(Job(config))
+    assert fault.value.exit_code == 75
+    (folder.path / "holder.txt").write_text("process 1 on a machine long gone\n")
+    with folder.held():
+        pass
+
+
+def test_time_that_is_up_commits_and_says_how_to_continue(tiny: Compose) -> None:
+    config = tiny("budget.wall_clock=1s", *LONG)
+    with pytest.raises(Fault, match=r"budget\.wall_clock: run .* is committed at step .*; continue with: ") as fault:
+        train(Job(config))
+    assert fault.value.exit_code == 124
+    assert RunFolder.of(config).state == "interrupted"
+
+
+def with_time(config: Config, text: str) -> Config:
+    """A config with a time as it is written on a command line."""
+    tree = to_dict(config)
+    tree["budget"]["wall_clock"] = read_override(f"budget.wall_clock={text}").value()
+    return parse(Config, tree)
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("90", 90), ("90s", 90), ("10min", 600), ("10m", 600), ("3h", 10_800), ("1h30m", 5_400)]
+)
+def test_a_time_is_read_in_the_usual_ways_and_is_no_part_of_the_identity(
+    tiny: Compose, text: str, seconds: int
+) -> None:
+    config = with_time(tiny(), text)
+    assert config.budget.seconds == seconds
+    assert config.identity() == tiny().identity()
+
+
+@pytest.mark.parametrize("text", ["3x", "0", "h", "-3h", "'3 h'"])
+def test_a_time_that_is_none_is_refused_in_one_line(tiny: Compose, text: str) -> None:
+    with pytest.raises(ConfigError, match=r"budget\.wall_clock"):
+        with_time(tiny(), text)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 64 MiB, where mounting one is allowed."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ("mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", str(disk))
+    if (refused := subprocess.run(mount, capture_output=True, text=True, check=False)).returncode:
+        pytest.skip(f"may not mount a file system: {refused.stderr.strip()}")
+    yield disk
+    subprocess.run(("umount", str(disk)), check=True)
+
+
+@pytest.mark.slow
+def test_a_full_disk_is_one_clear_line_and_costs_nothing_committed(tiny: Compose, small_disk: Path) -> None:
+    chosen = (*SHORT, "phase.quick.steps=100", "tracking.commit_seconds=1e-9")
+    config = at(tiny(*chosen), small_disk)
+    folder, ballast = RunFolder.of(config), small_disk / "ballast"
+    train(Job(dataclasses.replace(config, budget=dataclasses.replace(config.budget, steps=50))))
+    for space in (0, 4, 8, 64):  # KiB: no config, no replay segment, no state, no tensors
+        filesystem = os.statvfs(small_disk)
+        ballast.write_bytes(bytes(max(filesystem.f_bavail * filesystem.f_frsize - space * 1024, 0)))
+        with pytest.raises((Fault, OSError), match="No space left on device") as fault:
+            train(Job(config))
+        assert "\n" not in str(fault.value)
+        ballast.unlink()
+        state = Checkpoints(folder.path / "checkpoints", config.identity()).load(warn=pytest.fail)
+        assert state is not None
+        assert state["counters"]["steps"] == 50
+    train(Job(config))
+    assert folder.state == "done"
+    unbroken = tiny(*chosen)
+    train(Job(unbroken))
+    assert fingerprints(config, small_disk) == fingerprints(unbroken, Path(unbroken.paths.outputs))
+
+
+def test_a_commit_that_the_disk_refuses_is_one_clear_line_and_costs_nothing_committed(
+    tiny: Compose, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = tiny(*SHORT, "tracking.commit_seconds=1e-9")
+    synced, calls = os.fsync, iter(range(100))
+
+    def full(file: int) -> None:
+        if next(calls, None) is None:
+            raise OSError(28, "No space left on device")
+        synced(file)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(Fault, match="No space left on device; continue with: "):
+            train(Job(config))
+    folder = RunFolder.of(config)
+    assert folder.state == "interrupted"
+    train(Job(config))
+    unbroken = at(config, Path(config.paths.outputs, "u"))
+    train(Job(unbroken))
+    assert fingerprints(config, Path(config.paths.outputs)) == fingerprints(unbroken, Path(unbroken.paths.outputs))
+
+
+def test_a_journal_that_was_cut_is_one_clear_line(tiny: Compose) -> None:
+    config = tiny("budget.steps=80", "evaluation.at_end=false", "evaluation.every_steps=null")
+    train(Job(config))
+    path = RunFolder.of(config).path / "journal.jsonl"
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(Fault, match="is shorter than the checkpoint says"):
+        train(Job(tiny("evaluation.at_end=false", "evaluation.every_steps=null")))
+
+
+def points(outputs: Path, name: str) -> list[tuple[Any, ...]]:
+    with closing(sqlite3.connect(outputs / "mlflow.db")) as database:
+        return database.execute(
+            "SELECT metrics.key, step, timestamp, metrics.value FROM metrics JOIN runs USING (run_uuid) "
+            "JOIN tags USING (run_uuid) WHERE tags.key = 'atlantis.folder' AND tags.value LIKE ? "
+            "AND lifecycle_stage = 'active' ORDER BY metrics.key, timestamp, step",
+            (f"%/{name}",),
+        ).fetchall()
+
+
+def journaled(folder: Path) -> list[tuple[Any, ...]]:
+    found = [
+        (key, record.step, record.time, value)
+        for _, record in read(folder)
+        if isinstance(record, Metrics)
+        for key, value in record.values.items()
+    ]
+    return sorted(found, key=lambda point: (point[0], point[2], point[1]))
+
+
+def test_a_killed_run_is_shown_as_interrupted_then_continued_and_sigterm_ends_it_with_143(
+    tiny: Compose, tiny_overrides: tuple[str, ...]
+) -> None:
+    folder = RunFolder.of(tiny(*LONG))
+    killed = session(tiny(*LONG), tiny_overrides, *LONG)
+    wait_for(lambda: generation(folder) > 0)
+    assert str(folder.state) == "running"
+    with pytest.raises(Fault, match=f"is held by process {killed.pid} on"), folder.held():
+        pass
+    killed.kill()
+    killed.wait()
+    assert folder.state == "interrupted"
+
+    before = generation(folder)
+    ended = session(tiny(*LONG), tiny_overrides, *LONG)
+    wait_for(lambda: generation(folder) > before)
+    ended.send_signal(signal.SIGTERM)
+    out, error = ended.communicate()
+    assert ended.returncode == 143
+    assert f"run {folder.name} was killed; the command that started it continues it" in out
+    assert f"continuing run {folder.name} at step" in out
+    assert error.startswith(f"atlantis_exp: SIGTERM: run {folder.name} is committed at step")
+    assert "continue with: python -m atlantis_exp experiment=quick" in error
+    assert folder.status == "KILLED"
+
+
+@pytest.mark.slow
+def test_the_next_command_tells_mlflow_of_a_run_that_was_killed(tiny: Compose) -> None:
+    config = tiny(*SHORT, "budget.steps=20", "tracking=mlflow")
+    outputs = Path(config.paths.outputs)
+    train(Job(config))
+    journal = Journal(RunFolder.of(config).path)
+    journal.status("RUNNING")
+    publish(RunFolder.of(config).path, Store(outputs))
+
+    def shown() -> list[tuple[str, str]]:
+        query = "SELECT status, value FROM runs JOIN tags USING (run_uuid) WHERE key = 'resumable'"
+        with closing(sqlite3.connect(outputs / "mlflow.db")) as database:
+            return database.execute(query).fetchall()
+
+    assert shown() == [("RUNNING", "false")]
+    catch_up(outputs)
+    assert shown() == [("KILLED", "true")]
+
+
+@pytest.mark.slow
+def test_a_server_that_is_gone_for_a_while_has_everything_once_it_is_back(
+    tiny: Compose, tiny_overrides: tuple[str, ...], tmp_path: Path, free_port: Callable[[], int], mlflow_server: Served
+) -> None:
+    port = free_port()
+    server = tmp_path / "server"
+    server.mkdir()
+    chosen = (
+        *("tracking=mlflow", f"tracking.uri=http://127.0.0.1:{port}", "tracking.every_steps=200", *LONG),
+        *("evaluation.every_steps=1_000", "tracking.histogram_episodes=50"),
+    )
+    config = tiny(*chosen)
+    folder = RunFolder.of(config).path
+
+    def published() -> int:
+        file = folder / "published.json"
+        return int(json.loads(file.read_bytes())["offset"]) if file.exists() else 0
+
+    def evaluations() -> int:
+        return len(list(folder.glob("artifacts/evaluation/*.csv")))
+
+    with mlflow_server(server, port):
+        training = session(config, tiny_overrides, *chosen)
+        wait_for(lambda: published() > 0)
+    before, evaluated = published(), evaluations()
+    time.sleep(6.0)  # seconds; the publisher looks every 5
+    wait_for(lambda: evaluations() >= evaluated + 3)
+    assert published() == before
+    with mlflow_server(server, port):
+        training.send_signal(signal.SIGTERM)
+        out, error = training.communicate()
+        assert training.returncode == 143
+        assert (out + error).count("Publishing to MLflow fails") == 1
+        publish(folder, Store(tmp_path, tracking_uri=config.tracking.uri))  # what the command did not wait for
+
+    records = [record for _, record in read(folder)]
+    assert points(server, folder.name) == journaled(folder)
+    runs = list((server / "artifacts").glob("*/*/artifacts/config.json"))
+    assert len(runs) == 1
+    images = [record for record in records if isinstance(record, Image)]
+    shown = [path.name for path in (runs[0].parent / "images").iterdir()]
+    assert len(images) >= 3
+    for record in images:
+        name = f"{record.key.replace('/', '~')}+step+{record.step}+timestamp+{record.time}+"
+        assert len([file for file in shown if file.startswith(name)]) == 2  # one and its thumbnail
+    assert len(shown) == 2 * len(images)
+    for artifact in {record.path for record in records if isinstance(record, Artifact)}:
+        assert (runs[0].parent / artifact).read_bytes() == (folder / "artifacts" / artifact).read_bytes()
+    models = [folder / "artifacts" / record.path for record in records if isinstance(record, Model)]
+    stored = [path.read_bytes() for path in (server / "artifacts").glob("*/models/*/artifacts/*")]
+    assert sorted(stored) == sorted(path.read_bytes() for path in models)
+
+
+def test_a_sweep_runs_what_is_missing_and_tables_what_it_found(
+    tiny: Compose,
+    tiny_overrides: tuple[str, ...],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config, missing = tiny(*SHORT), tiny(*SHORT, "seed=1")
+    train(Job(config))
+    capsys.readouterr()
+    monkeypatch.setattr(sys, "argv", ["atlantis_exp"])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    VERB.run([*tiny_overrides, *SHORT, f"paths.outputs={config.paths.outputs}", "seed=0,1", "-m"])
+    done, error = capsys.readouterr()
+    assert error == ""
+    tables = [line for line in done.splitlines() if line.startswith("sweep of 2 runs")]
+    assert tables == ["sweep of 2 runs: 1 done, 1 missing", "sweep of 2 runs: 2 done"]
+    assert f"run {config.run_name()} has ended" in done
+    assert f"starting run {missing.run_name()}" in done
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("model=cnn", "env.num_envs=1", "phase.quick.steps=20_000"),
+        ("model=resnet", "env.size=16", "env.num_envs=8", "env.workers=2", "phase.quick.steps=20_000"),
+    ],
+)
+@pytest.mark.timeout(1_200)  # seconds
+def test_a_training_killed_twenty_times_is_the_unbroken_one_and_mlflow_has_each_point_once(
+    tiny: Compose, tiny_overrides: tuple[str, ...], tmp_path: Path, overrides: tuple[str, ...]
+) -> None:
+    chosen = (*overrides, "evaluation.every_steps=null", "tracking.histogram_episodes=100", "tracking.every_steps=100")
+    config = tiny(*chosen)
+    assert train_and_kill(config, (*tiny_overrides, *chosen), tmp_path / "unbroken", 0) == 0
+    killed = tmp_path / "killed"
+    struck = train_and_kill(config, (*tiny_overrides, *chosen, "tracking=mlflow"), killed, 20)
+    assert struck >= 15  # each after a commit of its own session; the last ones may find the training at its end
+    assert fingerprints(config, tmp_path / "unbroken") == fingerprints(config, killed)
+    publish(killed / "runs" / config.run_name(), Store(killed))  # what the last command did not wait for
+    shown = points(killed, config.run_name())
+    assert shown == journaled(killed / "runs" / config.run_name())
+    for key in {point[0] for point in shown}:
+        steps = [step for other, step, *_ in shown if other == key]
+        assert steps == sorted(steps)
+        # Episodes of several environments may end at one step.
+        assert len(set(steps)) == len(steps) or (config.env.num_envs > 1 and key.startswith(("score/", "throughput/")))
+
+
+@pytest.mark.slow
+def test_a_machine_that_cannot_compile_is_told_in_one_line(tiny_overrides: tuple[str, ...], tmp_path: Path) -> None:
+    done = subprocess.run(
+        (*COMMAND, *tiny_overrides, "compile=true", f"paths.outputs={tmp_path}"),
+        cwd=REPOSITORY,
+        env={**os.environ, "CXX": str(tmp_path / "none"), "TORCHINDUCTOR_FORCE_DISABLE_CACHES": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert "torch.compile failed, InvalidCxxCompiler" in done.stderr.splitlines()[-1]
+    assert done.stderr.splitlines()[-1].endswith("compile=false does without")
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_verify_resume_records_its_verdict(tiny_overrides: tuple[str, ...], tmp_path: Path) -> None:
+    overrides = (*tiny_overrides, "phase.quick.steps=4_000", "evaluation.every_steps=null", f"paths.outputs={tmp_path}")
+    done = subprocess.run(
+        (*COMMAND, "verify-resume", *overrides), cwd=REPOSITORY, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1].endswith("is the unbroken one, bit for bit")
+    [path] = (tmp_path / "verifications").glob("*/artifacts/fingerprints.json")
+    hashes = json.loads(path.read_bytes())
+    assert hashes["unbroken"] == hashes["killed"]

@@ -1,0 +1,184 @@
+"""A training of tenths of seconds: a game of a few lines, a network of one layer, parts put together by hand."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from rich.console import Console
+from torch import nn
+
+from atlantis_exp.game.emulator import ACTIONS, Emulator, Step
+from atlantis_exp.game.preprocessing import FrameStack
+from atlantis_exp.game.vector import Emulators, make_emulators
+from atlantis_exp.learning.learner import Learner
+from atlantis_exp.learning.objectives import DQN
+from atlantis_exp.learning.schedules import Constant, Exponential
+from atlantis_exp.replay.memory import ReplayMemory, Returns
+from atlantis_exp.replay.samplers import UniformSampler
+from atlantis_exp.runs.journal import Journal
+from atlantis_exp.training.actor import EpsilonGreedy
+from atlantis_exp.training.checkpoint import Checkpoints
+from atlantis_exp.training.evaluator import Evaluator
+from atlantis_exp.training.plan import Cadence, Phase, Plan
+from atlantis_exp.training.progress import Progress
+from atlantis_exp.training.recorder import Recorder
+from atlantis_exp.training.trainer import Trainer
+
+SIZE = 8  # pixels
+STACK = 4  # observations
+CAPACITY = 120  # observations
+BUDGET = 2**20  # bytes
+
+
+@dataclass
+class Game:
+    """Takes an Emulator's place: noise on the screen and in the rewards, and an episode is truncated after `steps`."""
+
+    steps: int = 40
+
+    def __post_init__(self) -> None:
+        self.preprocessing = SimpleNamespace(size=SIZE)
+        self.generator = np.random.default_rng(0)
+        self.played = 0
+
+    def reset(self, seed: int | None = None) -> npt.NDArray[np.uint8]:
+        if seed is not None:
+            self.generator = np.random.default_rng(seed)
+        self.played = 0
+        return self.screen()
+
+    def step(self, action: int) -> Step:
+        self.played += 1
+        reward = 100.0 * self.generator.integers(3) * (action > 0)
+        return Step(self.screen(), reward, False, self.played == self.steps, False, int(self.generator.integers(2, 5)))
+
+    def screen(self) -> npt.NDArray[np.uint8]:
+        return self.generator.integers(256, size=(SIZE, SIZE), dtype=np.uint8)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"generator": self.generator.bit_generator.state, "played": self.played}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.generator.bit_generator.state, self.played = state["generator"], state["played"]
+
+
+def emulators_of(num_envs: int, steps: int = 40) -> Emulators:
+    return make_emulators(cast(Callable[[], Emulator], partial(Game, steps)), num_envs, 0)
+
+
+def learner_of(seed: int = 0, **options: Any) -> Learner:
+    def network() -> nn.Module:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            return nn.Sequential(nn.Flatten(), nn.Linear(STACK * SIZE * SIZE, len(ACTIONS)))
+
+    online = network()
+    optimizer = torch.optim.AdamW(online.parameters(), 1e-3)
+    return Learner(online, network(), optimizer, DQN(), 1e-4, **options)
+
+
+PLAN = Plan(
+    unit="steps",
+    phases=[Phase("quick", 160, 1e-3, UniformSampler())],
+    epsilon=Exponential(0.9, 0.02, 0.5),
+    learning_rate=Constant(1.0),
+    returns=Returns(0.99),
+    terminal_on_life_loss=False,
+    learn_every=4,
+    learn_start=20,
+    batch_size=4,
+)
+CADENCE = Cadence(
+    curve_steps=20,
+    histogram_episodes=500,
+    commit_episodes=100,
+    commit_seconds=1e9,
+    evaluate_episodes=None,
+    evaluate_steps=80,
+    evaluate_at_end=True,
+    interim_episodes=2,
+    final_episodes=2,
+)
+
+
+@pytest.fixture(autouse=True)
+def _pictures_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To draw one takes longer than a training here, and `media` has tests of its own."""
+    for name in ("score_histogram", "score_heatmap"):
+        monkeypatch.setattr(f"atlantis_exp.training.recorder.{name}", lambda *arguments: repr(arguments).encode())
+
+
+@pytest.fixture
+def small() -> Callable[..., Trainer]:
+    """Builds a trainer in a folder and continues from the checkpoint there: `small(tmp_path, num_envs=3)`.
+
+    Fields of `Plan` and `Cadence` may be given by their names; episode_steps is an episode's length, capacity the
+    replay memory's in observations, console what is told.
+    """
+
+    def built(
+        folder: Path,
+        *,
+        num_envs: int = 1,
+        seed: int = 0,
+        episode_steps: int = 40,
+        capacity: int = CAPACITY,
+        max_steps: int | None = None,
+        console: Console | None = None,
+        **options: Any,
+    ) -> Trainer:
+        plan = Plan(**{**vars(PLAN), **_taken(options, Plan)})
+        cadence = Cadence(**{**vars(CADENCE), **_taken(options, Cadence)})
+        assert not options, options
+        exploration, sampling, emulation = np.random.SeedSequence(seed).spawn(3)
+        learner = learner_of(seed)
+        memory = ReplayMemory(capacity, (SIZE, SIZE), stack=STACK, budget_bytes=BUDGET)
+        evaluator = Evaluator(
+            make_emulators=partial(emulators_of, steps=episode_steps),
+            make_emulator=cast(Callable[[], Emulator], Game),
+            epsilon=0.05,
+            seed=1_000_003,
+            num_envs=1,
+            size=SIZE,
+            stack=STACK,
+            video=False,
+        )
+        trainer = Trainer(
+            plan=plan,
+            emulators=emulators_of(num_envs, episode_steps),
+            stack=FrameStack(num_envs, SIZE, STACK),
+            actor=EpsilonGreedy(learner.q_values, len(ACTIONS)),
+            memory=memory,
+            learner=learner,
+            exploration=[np.random.default_rng(child) for child in exploration.spawn(num_envs)],
+            sampling=np.random.default_rng(sampling),
+            seeds=emulation.generate_state(num_envs).tolist(),
+            recorder=Recorder(
+                plan=plan,
+                cadence=cadence,
+                learner=learner,
+                memory=memory,
+                tracker=Journal(folder),
+                progress=Progress(console or Console(quiet=True)),
+                evaluate=partial(evaluator, EpsilonGreedy(learner.evaluated_q_values, len(ACTIONS), watches=True)),
+            ),
+            checkpoints=Checkpoints(folder / "checkpoints", "small"),
+            max_steps=max_steps,
+        )
+        if (state := trainer.checkpoints.load(trainer.memory)) is not None:
+            trainer.load_state_dict(state)
+        return trainer
+
+    return built
+
+
+def _taken(options: dict[str, Any], schema: type) -> dict[str, Any]:
+    names: Sequence[str] = [field.name for field in fields(schema)]
+    return {name: options.pop(name) for name in names if name in options}

@@ -1,0 +1,130 @@
+"""What is expected of a training: measured on its own parts, which are as before afterwards."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from atlantis_exp.build import build_trainer
+from atlantis_exp.config import Config
+from atlantis_exp.replay.samplers import PrioritizedSampler
+from atlantis_exp.runs.journal import Journal
+from atlantis_exp.training import forecast as forecast_module
+from atlantis_exp.training.fingerprint import fingerprint, history
+from atlantis_exp.training.forecast import Forecast, forecast
+from atlantis_exp.training.plan import Phase
+from atlantis_exp.training.progress import Progress
+from atlantis_exp.training.trainer import Trainer
+
+GIB = 2**30
+
+
+@pytest.fixture(autouse=True)
+def timed(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
+    """Each measurement is as often as it must be, and said to take a millisecond; returns what was asked for."""
+    asked = []
+
+    def median_seconds(call: Callable[[], object], at_least: int, seconds: float) -> float:
+        for _ in range(at_least):
+            call()
+        asked.append((at_least, seconds))
+        return 1e-3
+
+    monkeypatch.setattr(forecast_module, "_median_seconds", median_seconds)
+    return asked
+
+
+def expected_of(trainer: Trainer, size: int, **chosen: Any) -> Forecast:
+    asked = {"capacity": 120, "max_bytes": 2**22, "steps_done": trainer.counters.steps, "evaluations_an_episode": 0.0}
+    return forecast(trainer, size=size, stack=4, **{**asked, **chosen})
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_a_training_with_a_forecast_is_bit_for_bit_the_one_without(
+    small: Callable[..., Trainer], tmp_path: Path, num_envs: int, timed: list[tuple[int, float]]
+) -> None:
+    prints, histories = [], []
+    for name in ("without", "with"):
+        phases = [Phase("quick", 160, 1e-3, PrioritizedSampler(0.5, 0.5))]
+        trainer = small(tmp_path / name, num_envs=num_envs, phases=phases)
+        if name == "with":
+            assert trainer.learner.update_flops((4, 8, 8), 4) > 0
+            expected_of(trainer, 8)
+        trainer.run()
+        prints.append(fingerprint(trainer.state_dict(), trainer.memory, tmp_path / name))
+        histories.append(history(tmp_path / name))
+    assert len(timed) == 3
+    assert prints[0] == prints[1]
+    assert histories[0] == histories[1] != []
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("model=cnn",),
+        pytest.param(("model=resnet", "env.size=16", "training.ema=10"), marks=pytest.mark.slow),
+        pytest.param(("env.num_envs=3", "env.workers=2", "sampler=prioritized"), marks=pytest.mark.slow),
+        pytest.param(("model=resnet_fast", "objective=quantile", "env.noop_max=5"), marks=pytest.mark.slow),
+    ],
+)
+def test_a_real_training_is_none_the_wiser_of_forecasts_at_its_start_and_when_it_goes_on(
+    tiny: Callable[..., Config],
+    started: Callable[[Config, Path], Trainer],
+    tmp_path: Path,
+    overrides: tuple[str, ...],
+) -> None:
+    config = tiny("evaluation.every_steps=null", *overrides)
+    without = started(config, tmp_path / "without")
+    without.run()
+    size = config.env.size
+    first = started(config, tmp_path / "with")
+    first.learner.update_flops((4, size, size), 4)
+    expected_of(first, size)
+    first.run(lambda: first.counters.steps >= 60)
+
+    second = build_trainer(config, tmp_path / "with", Journal(tmp_path / "with"), Progress(Console(quiet=True)))
+    with second.emulators:
+        state = second.checkpoints.load(second.memory)
+        assert state is not None
+        expected_of(second, size, steps_done=60)  # by parts that have yet to be brought to where they were
+        second.load_state_dict(state)
+        second.run()
+        assert fingerprint(second.state_dict(), second.memory, tmp_path / "with") == fingerprint(
+            without.state_dict(), without.memory, tmp_path / "without"
+        )
+
+
+def test_what_is_left_is_expected_of_a_training(small: Callable[..., Trainer], tmp_path: Path) -> None:
+    trainer = small(tmp_path, num_envs=2, epsilon=lambda *_: 0.5, learn_every=4)
+    whole = expected_of(trainer, 8)
+    seconds_a_step = (1e-3 + 0.75 * 1e-3) / 2 + 1e-3 / 4
+    assert whole.steps == 160
+    assert whole.steps_per_second == pytest.approx(1 / seconds_a_step)
+    assert whole.hours == pytest.approx(160 * seconds_a_step / 3600)
+    assert expected_of(trainer, 8, steps_done=100).steps == 60
+    assert expected_of(small(tmp_path, max_steps=50), 8, steps_done=20).steps == 30
+    assert expected_of(trainer, 8, steps_done=500).steps == 1
+    assert expected_of(trainer, 8, max_bytes=1_000).memory == 1_000 + 2**29
+    more = expected_of(trainer, 8, evaluations_an_episode=1_000.0)
+    weights = sum(tensor.nbytes for tensor in trainer.learner.network.state_dict().values())
+    assert more.disk - whole.disk == pytest.approx(2 * weights * 1_000 * 160 / 2_000, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("memory", "disk", "said"),
+    [
+        (GIB, GIB, None),
+        (3 * GIB, GIB, "memory will not suffice: 3.0 GiB needed, 2.0 GiB available; lower replay.max_bytes"),
+        (GIB, 3 * GIB, "disk will not suffice: 3.0 GiB needed, 2.0 GiB free; lower replay.capacity"),
+    ],
+)
+def test_a_shortage_is_named_with_what_to_do_about_it(memory: int, disk: int, said: str | None) -> None:
+    expected = Forecast(100.0, 3_600_000, memory, 2 * GIB, disk, 2 * GIB)
+    assert (expected.shortage or "").startswith(said or "")
+    assert (expected.shortage is None) == (said is None)
+    assert str(Forecast(100.0, 3_600_000, GIB, 2 * GIB, 2**20, 2 * GIB)) == (
+        "expect about 100 steps/s, 10.0 hours for 3,600,000 steps, 1.0 GiB of memory (2.0 GiB available), "
+        "1 MiB of disk (2.0 GiB free)"
+    )
