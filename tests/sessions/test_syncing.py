@@ -292,13 +292,13 @@ def test_every_folder_of_the_outputs_is_published_and_stays_at_home(tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_it_goes_on_looking_until_it_is_interrupted(tmp_path: Path) -> None:
-    command = (sys.executable, "-m", "atlantis_exp", "sync", "every=1s", f"paths.outputs={tmp_path}")
+def test_it_goes_on_looking_until_it_is_interrupted(outputs: Path) -> None:
+    command = (sys.executable, "-m", "atlantis_exp", "sync", "every=1s", f"paths.outputs={outputs}")
     looking = subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert looking.stdout is not None
         assert looking.stdout.readline().endswith("mlflow.db: 0 runs\n")
-        a_sweep_of_one(tmp_path, "late")
+        a_sweep_of_one(outputs, "late")
         seen: set[str] = set()
         while not {"  published   runs/late\n", "  published   sweeps/sweep-late\n"} <= seen:
             seen.add(line := looking.stdout.readline())
