@@ -5,12 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import t as student_t
 from scipy.stats import trim_mean
 
 Scores = npt.NDArray[np.float64]
 
-FEWEST_SEEDS = 3  # a group, below which no spread is to be trusted
 RANDOM_SCORE = 12_850.0  # of the random player, as published; Quan and Ostrovski, dqn_zoo/atari_data.py
 HUMAN_SCORE = 29_028.1  # of the professional tester; the same table
 EARLY_FRAMES = 10_000_000  # of training, up to which published DQN stays below the random player or near it
@@ -102,50 +100,3 @@ def probability_of_improvement(scores: Scores, others: Scores) -> float:
     ordered = np.sort(others)
     below = np.searchsorted(ordered, scores, "left") + np.searchsorted(ordered, scores, "right")
     return float(below.sum() / (2 * scores.size * others.size))
-
-
-@dataclass(frozen=True)
-class Difference:
-    """How far the mean over one group's seeds lies above another's, with Welch's 95 % interval.
-
-    The ends are NaN where a group has a single seed, which says nothing about the next one.
-    """
-
-    value: float
-    low: float
-    high: float
-    more_seeds: int | None  # about, in each group, until it is decided; None where a thousand would not do
-
-    @property
-    def is_decided(self) -> bool:
-        """Whether there are seeds enough and the interval leaves out zero."""
-        return self.more_seeds == 0
-
-
-def difference(seeds: npt.ArrayLike, others: npt.ArrayLike) -> Difference:
-    """Compare two groups by one value a seed (Welch 1947).
-
-    Decided needs `FEWEST_SEEDS` in each group and an interval without zero. `more_seeds` is the least n that is enough
-    for both when means and variances stay as they are, less the size of the smaller group.
-    """
-    groups = [np.asarray(values, np.float64) for values in (seeds, others)]
-    value = float(groups[0].mean() - groups[1].mean())
-    smaller = min(group.size for group in groups)
-    if smaller < 2:
-        return Difference(value, np.nan, np.nan, FEWEST_SEEDS - smaller)
-    variances = [float(group.var(ddof=1)) for group in groups]
-    half = _half_width(variances, [group.size for group in groups])
-    more: int | None = 0
-    if smaller < FEWEST_SEEDS or abs(value) <= half:
-        sizes = range(max(FEWEST_SEEDS, smaller + 1), 1_000)
-        more = next((n - smaller for n in sizes if abs(value) > _half_width(variances, [n, n])), None)
-    return Difference(value, value - half, value + half, more)
-
-
-def _half_width(variances: Sequence[float], sizes: Sequence[int]) -> float:
-    """Of Welch's 95 % interval; degrees of freedom by Welch and Satterthwaite."""
-    errors = [variance / size for variance, size in zip(variances, sizes, strict=True)]
-    if sum(errors) == 0:
-        return 0.0
-    freedom = sum(errors) ** 2 / sum(error**2 / (size - 1) for error, size in zip(errors, sizes, strict=True))
-    return float(student_t.ppf(0.975, freedom) * np.sqrt(sum(errors)))

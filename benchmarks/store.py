@@ -96,7 +96,7 @@ def write_journal(path: Path, episodes: int, rng: np.random.Generator) -> None:
 _MEANS = {"mean_20": 20, "mean_100": 100, "best_100": 100}
 
 
-def work_of(verb: Verb[Any], *overrides: str) -> Callable[[], None]:
+def work_of(verb: Verb[Any], *overrides: str) -> Callable[[], object]:
     """The work that a command line of a verb asks for, without Hydra."""
     (config,) = check(verb.name, verb.schema, overrides).values()
     return verb.work(Asked(config, verb.name, overrides))
@@ -113,7 +113,7 @@ def publish_nothing(outputs: Path) -> None:
             write_file(folder / "published.json", json.dumps(dataclasses.asdict(note)).encode())
 
 
-def measure(command: Callable[[], None]) -> tuple[float, float]:
+def measure(command: Callable[[], object]) -> tuple[float, float]:
     """Seconds and peak resident MiB of a command in a process of its own, which is forked after the imports."""
     start = time.perf_counter()
     child = os.fork()
@@ -149,7 +149,7 @@ def main(arguments: Sequence[str] = ()) -> None:
             with ledger(jobs, ["seed=0,1"]):
                 pass
 
-        commands: dict[str, Callable[[], None]] = {
+        commands: dict[str, Callable[[], object]] = {
             "compare": lambda: work_of(COMPARE, of, "tracking=none")(),
             "sweep": table,
             "report": lambda: work_of(REPORT, of)(),

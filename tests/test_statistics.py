@@ -18,7 +18,6 @@ from atlantis_exp.statistics import (
     HUMAN_SCORE,
     RANDOM_SCORE,
     Scores,
-    difference,
     human_normalised,
     interquartile_mean,
     interval,
@@ -158,50 +157,6 @@ def test_seeds_that_differ_widen_the_interval_that_episodes_alone_would_give() -
 def test_a_bootstrap_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="at least one seed"):
         resample([], 10, np.random.default_rng(0))
-
-
-VALUES = st.lists(st.floats(-1e6, 1e6).map(lambda value: round(value, 1)), min_size=2, max_size=8)
-
-
-@settings(deadline=None)
-@given(VALUES, VALUES)
-def test_a_difference_is_scipys_welch(seeds: list[float], others: list[float]) -> None:
-    found = difference(seeds, others)
-    assert found.value == pytest.approx(np.mean(seeds) - np.mean(others), abs=1e-6)
-    if min(np.var(seeds), np.var(others)) > 1e-3:
-        theirs = scipy.stats.ttest_ind(seeds, others, equal_var=False).confidence_interval(0.95)
-        assert (found.low, found.high) == pytest.approx((theirs.low, theirs.high), rel=1e-9, abs=1e-4)
-
-
-def test_the_missing_seeds_are_the_fewest_that_would_decide() -> None:
-    seeds, others = np.array([900.0, 1_200.0, 1_500.0]), np.array([600.0, 900.0, 1_200.0])
-    found = difference(seeds, others)
-    assert not found.is_decided
-    assert found.more_seeds is not None
-
-    def half(n: int) -> float:  # of the interval of two groups of n with these variances, 300^2 each
-        return float(scipy.stats.t.ppf(0.975, 2 * n - 2) * 300 * np.sqrt(2 / n))
-
-    needed = 3 + found.more_seeds
-    assert half(needed) < found.value <= half(needed - 1)
-
-
-@pytest.mark.parametrize(
-    ("seeds", "others", "more"),
-    [
-        ([9.0], [1.0], 2),  # one seed says nothing of the next
-        ([9.0, 9.0, 9.0], [1.0], 2),
-        ([9.0, 9.1], [1.0, 1.1], 1),  # apart, but two seeds are too few
-        ([9.0, 9.1, 9.2], [1.0, 1.1, 1.2], 0),
-        ([2_000.0] * 3, [1_000.0] * 3, 0),
-        ([2_000.0] * 3, [2_000.0] * 3, None),
-        ([1.0, 1e6, 2e6], [2.0, 1e6, 2e6], None),
-    ],
-)
-def test_decided_needs_three_seeds_each_and_an_interval_without_zero(
-    seeds: list[float], others: list[float], more: int | None
-) -> None:
-    assert difference(seeds, others).more_seeds == more
 
 
 def test_human_normalised_is_zero_for_the_random_player_and_one_for_the_human() -> None:

@@ -266,7 +266,7 @@ def test_what_was_trained_is_evaluated_compared_and_reported(
     assert (result["evaluation"]["evaluation/episodes"], result["evaluation"]["actions/random_share"]) == (3, 1)
     assert len((evaluated / "artifacts/evaluation/episodes.csv").read_text().splitlines()) == 4
 
-    assert command("compare", "by=seed", "at_epsilon=0.05", "resamples=100", "tracking=none", place) == 0
+    assert command("compare", "by=seed", "at_epsilon=0.05", "tracking=none", place) == 0
     page = Path(capsys.readouterr().out.rstrip().splitlines()[-1])
     assert page.is_relative_to(tmp_path / "comparisons")
     runs = (page.parent / "tables" / "runs.csv").read_text()

@@ -14,6 +14,7 @@ VERBS = {
     "export": "a stored run's network as a folder to hand on: weights, card and scores: run=NAME to=pretrained/NAME",
     "baseline": "a player without a network as a tracked run: agent=random, agent=constant",
     "play": "a person at the keyboard as a tracked run: player=NAME",
+    "decide": "the question itself: trains the seeds that it needs, stops when it is answered: model=cnn,resnet_fast",
     "compare": "finished runs as groups: intervals, a verdict, a page of figures: by=model,sampler",
     "query": "what the environment is, and what this config makes of it",
     "verify-resume": "proves, for any training, that killing and continuing it changes no bit",

@@ -43,7 +43,7 @@ class Verb(Generic[T]):
 
     name: str
     schema: type[T]
-    work: Callable[[Asked[T]], Callable[[], None]]
+    work: Callable[[Asked[T]], Callable[[], object]]
     """Imports what does the work, and returns the call that does it."""
     config_name: str = ""  # of the file under conf/; that of the verb unless it says otherwise
     rewrite: Callable[[list[str]], list[str]] = list

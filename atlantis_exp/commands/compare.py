@@ -3,13 +3,17 @@
 import re
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.config import STRICT, PathsConfig, Probability, TrackingConfig
+from atlantis_exp.faults import ConfigError
+
+if TYPE_CHECKING:
+    from atlantis_exp.comparison.verdict import Question
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -20,10 +24,38 @@ class CompareConfig:
     runs: list[str]  # names, starts of names or patterns; none: all
     where: list[str]  # KEY=VALUE; none: all
     at_epsilon: Probability | None  # of the evaluations; null: each run's latest
-    resamples: Annotated[int, Field(ge=100, le=1_000_000)]  # bootstrap samples
-    seed: Annotated[int, Field(ge=0)]  # of the bootstrap
+    baseline: str | None  # a value of one of the keys of by, or a group; null: all pairs
+    delta: str | float | None  # a difference that does not matter: 5% of a score, or points
+    seeds: Annotated[int, Field(ge=5, le=10_000)]  # a group, at the last look
+    error: Annotated[float, Field(gt=0, lt=1)]  # probability of any false verdict
+    look: Literal["due", "now"]
     tracking: TrackingConfig
     paths: PathsConfig
+
+    def __post_init__(self) -> None:
+        margin(self.delta)
+
+    @property
+    def question(self) -> "Question":
+        """What is asked of the groups."""
+        from atlantis_exp.comparison.verdict import Question
+
+        delta, relative = margin(self.delta)
+        return Question(tuple(self.by), self.seeds, self.error, delta, relative, self.baseline)
+
+
+def margin(delta: str | float | None) -> tuple[float | None, bool]:
+    """A difference that does not matter, and whether it is a share of a score. Raises: ConfigError."""
+    if delta is None:
+        return None, False
+    text = delta if isinstance(delta, str) else f"{delta:g}"
+    try:
+        value = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    except ValueError:
+        value = -1.0
+    if not 0 < value < float("inf"):
+        raise ConfigError(f"delta={text}: write a share of a score, as in delta=5%, or points, as in delta=500")
+    return value, text.endswith("%")
 
 
 def _list_out(arguments: list[str]) -> list[str]:
@@ -37,10 +69,21 @@ def _listed(match: re.Match[str]) -> str:
     return f"{match[1]}=[{','.join(items)}]"
 
 
-def _work(asked: Asked[CompareConfig]) -> Callable[[], None]:
+def _work(asked: Asked[CompareConfig]) -> Callable[[], object]:
     from atlantis_exp.comparison.comparing import compare
 
-    return partial(compare, **vars(asked.config), command=asked.command)
+    config = asked.config
+    return partial(
+        compare,
+        config.question,
+        runs=config.runs,
+        where=config.where,
+        at_epsilon=config.at_epsilon,
+        look_now=config.look == "now",
+        tracking=config.tracking,
+        paths=config.paths,
+        command=asked.command,
+    )
 
 
 VERB = Verb("compare", CompareConfig, _work, rewrite=_list_out)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from atlantis_exp.checking import digest
 from atlantis_exp.commands.app import Asked
-from atlantis_exp.commands.overrides import read_override
+from atlantis_exp.commands.overrides import check, read_override
 from atlantis_exp.config import Config
 from atlantis_exp.sessions.job import Job
 
@@ -46,3 +46,9 @@ def words_of(overrides: Sequence[str]) -> tuple[str, ...]:
     last = [key.rsplit(".", 1)[-1] for key in values]
     short = {key: name if last.count(name) == 1 else key for key, name in zip(values, last, strict=True)}
     return (*options.values(), *(f"{short[key]}={value}" if value else key for key, value in values.items()))
+
+
+def training_of(overrides: Sequence[str]) -> Job:
+    """The training that overrides make. Raises: ConfigError."""
+    ((texts, config),) = check("config", Config, overrides).items()
+    return job_of(Asked(config, "train", texts))

@@ -1,7 +1,7 @@
 """`python -m atlantis_exp search optimizer=adam,rmsprop trials=20`: the best values of any keys, by Optuna."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,11 +9,11 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
-from atlantis_exp.commands.jobs import job_of
-from atlantis_exp.commands.overrides import check, swept
+from atlantis_exp.commands.jobs import training_of
+from atlantis_exp.commands.overrides import swept
 from atlantis_exp.config import STRICT, Config, Count
 from atlantis_exp.faults import ConfigError, Fault
-from atlantis_exp.sessions.job import Job, command_line
+from atlantis_exp.sessions.job import command_line
 
 if TYPE_CHECKING:
     from atlantis_exp.sessions.search import Request
@@ -79,7 +79,7 @@ def request_of(asked: Asked[SearchConfig]) -> "Request":
         space=space,
         texts=texts,
         overrides=overrides,
-        job_of=_training,
+        job_of=training_of,
         corner=check_space(space, overrides),
         trials=config.trials,
         name=config.name,
@@ -88,11 +88,6 @@ def request_of(asked: Asked[SearchConfig]) -> "Request":
         spared=config.pruning.evaluations,
         command=command_line("search", *asked.overrides, *searched),
     )
-
-
-def _training(overrides: Sequence[str]) -> Job:
-    ((texts, config),) = check("config", Config, overrides).items()
-    return job_of(Asked(config, "train", texts))
 
 
 VERB = Verb("search", SearchConfig, _work, rewrite=_without_searched)

@@ -3,6 +3,7 @@
 import re
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from time import strftime
 
@@ -13,11 +14,14 @@ from rich.text import Text
 from atlantis_exp.checking import digest, flatten
 from atlantis_exp.comparison import tables
 from atlantis_exp.comparison.figures import draw
-from atlantis_exp.comparison.gather import gather, group, refuse_mixed_protocols, select
+from atlantis_exp.comparison.gather import COMMIT, Training, gather, group, refuse_mixed_protocols, select
+from atlantis_exp.comparison.looks import read_looks, write_looks
 from atlantis_exp.comparison.report import page, plain
 from atlantis_exp.comparison.tables import Comparison
+from atlantis_exp.comparison.verdict import Answer, Question, families, group_of
+from atlantis_exp.comparison.words import spent
 from atlantis_exp.config import PathsConfig, TrackingConfig
-from atlantis_exp.faults import ConfigError
+from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.provenance import provenance
@@ -27,85 +31,132 @@ _PAGE = "comparison.html"
 
 
 def compare(
+    question: Question,
     *,
-    by: Sequence[str],
     runs: Sequence[str],
     where: Sequence[str],
     at_epsilon: float | None,
-    resamples: int,
-    seed: int,
+    look_now: bool,
     tracking: TrackingConfig,
     paths: PathsConfig,
     command: str,
-) -> None:
-    """Compare all finished runs; print the verdict, and keep page, figures and tables as a run of their own.
+) -> Comparison:
+    """Compare all finished runs; print the answers, and keep page, figures and tables as a run of their own.
+
+    The same question of more seeds is the same comparison: its folder holds the looks taken so far.
 
     Raises:
-        ConfigError: where nothing is to be compared, or runs of different protocols would be.
+        ConfigError: where nothing is to be compared, runs of different protocols would be, or no group is the baseline.
+        Fault: where commits are compared with a baseline and another one is worse.
     """
     outputs = Path(paths.outputs)
-    gathered = gather(outputs, runs, at_epsilon)
+    gathered = gather(outputs, runs, at_epsilon, put_aside=COMMIT in question.by)
     for name, reason in gathered.skipped.items():
         print(f"atlantis_exp: left out {name}: {reason}", file=sys.stderr)
     trainings = select(gathered.trainings, where)
     if not trainings:
         raise ConfigError(f"there is no finished training under {outputs / 'runs'} that compare was asked for")
-    refuse_mixed_protocols(trainings, by)
-    groups = group(trainings, by)
-    comparison = tables.compare(gathered, groups, by, resamples, seed)
+    refuse_mixed_protocols(trainings, question.by)
+    groups = group(trainings, question.by)
+    asked = families([group_of(members, question.by) for members in groups.values()], question)
 
-    settings = {
-        "by": list(by),
+    identity = {
+        **asdict(question),
+        "by": list(question.by),
         "runs": list(runs),
         "where": list(where),
         "at_epsilon": at_epsilon,
-        "resamples": resamples,
-        "seed": seed,
+        "groups": [[label, *_recipes(members)] for label, members in groups.items()],
     }
-    facts = {**settings, "compared": [training.name for training in trainings]}
-    folder = RunFolder(outputs / "comparisons" / f"{_slug(comparison.groups)}-{digest(facts)}")
-    made = provenance(command)
-    shown = {
-        "command": made["command"],
-        "made": strftime("%Y-%m-%d %H:%M %Z"),
-        "code": made.get("git.commit", made["version.atlantis-exp"]),
-        "runs": f"{len(trainings)} under {outputs / 'runs'}",
-        "bootstrap": f"{tables.fewer_samples(groups, resamples):,} samples, seed {seed}",
-    }
-    figures = draw(comparison)
+    facts = {**identity, "compared": [training.name for training in trainings]}
+    folder = RunFolder(outputs / "comparisons" / f"{_slug(list(groups))}-{digest(identity)}")
     name, colour = folder.name, run_colour("comparison")
     tags = {"mlflow.runName": name, "mlflow.runColor": colour, "atlantis.kind": "comparison"}
-    with folder.held(), publishing(folder, tracking, outputs, tags) as journal:
-        folder.write_config(facts)
-        journal.params({key: str(value) for key, value in flatten(facts).items()})
-        journal.tags({**made, "verdict": comparison.verdict})
-        journal.note("\n\n".join([comparison.verdict, *comparison.notes]))
-        for view in comparison.tables["verdict"]:
-            name = view["view"].replace(" ", "_")
-            journal.metrics({f"{name}/difference": view["difference"], f"{name}/decided": view["decided"]}, 0)
-        journal.artifact(_PAGE, page(comparison, figures, shown).encode())
-        for name, figure in figures.items():
-            journal.artifact(f"figures/{name}.png", figure.png)
-        for name, table in comparison.tables.items():
-            journal.artifact(f"tables/{name}.csv", tables.to_csv(table).encode())
-        journal.finish()
+    with folder.held():
+        record = read_looks(folder.path, asked)
+        comparison = tables.compare(gathered, groups, question, record, look_now)
+        write_looks(folder.path, comparison.answers)
+        made = provenance(command)
+        shown = {
+            "command": made["command"],
+            "made": strftime("%Y-%m-%d %H:%M %Z"),
+            "code": made.get("git.commit", made["version.atlantis-exp"]),
+            "runs": f"{len(trainings)} under {outputs / 'runs'}",
+        }
+        figures = draw(comparison)
+        with publishing(folder, tracking, outputs, tags) as journal:
+            folder.write_config(facts)
+            journal.params({key: str(value) for key, value in flatten(facts).items()})
+            journal.tags({**made, "verdict": comparison.verdict})
+            journal.note("\n\n".join([comparison.verdict, *comparison.others, *comparison.beside, *comparison.notes]))
+            journal.metrics(_metrics(comparison), 0)
+            journal.artifact(_PAGE, page(comparison, figures, shown).encode())
+            for name, figure in figures.items():
+                journal.artifact(f"figures/{name}.png", figure.png)
+            for name, table in comparison.tables.items():
+                journal.artifact(f"tables/{name}.csv", tables.to_csv(table).encode())
+            journal.finish()
     _print(comparison)
     print(f"\n{folder.artifact(_PAGE)}")
+    if COMMIT in question.by and (worse := worse_than_baseline(comparison.answers)):
+        raise Fault(f"worse than the baseline {question.baseline}: {'; '.join(worse)}")
+    return comparison
+
+
+def worse_than_baseline(answers: Sequence[Answer]) -> list[str]:
+    """The groups that were found worse than their family's baseline, by how much."""
+    return [
+        f"{verdict.group} by {-verdict.difference:,.0f} points ({-verdict.high:,.0f} to {-verdict.low:,.0f}, "
+        f"{verdict.seeds} seeds each)"
+        for each in answers
+        for verdict in each.decision.verdicts
+        if each.family.plan.baseline is not None and verdict.said == "worse"
+    ]
+
+
+def _recipes(runs: Sequence[Training]) -> list[str]:
+    """What a group's runs are but for their seeds: their science, how long they trained and how they were evaluated."""
+    return sorted(
+        {
+            digest(
+                {key: value for key, value in run.science.items() if key != "seed"}
+                | {key: run.config[key] for key in ("budget.steps", "evaluation.epsilon")}
+            )
+            for run in runs
+        }
+    )
+
+
+def _metrics(comparison: Comparison) -> dict[str, float]:
+    """The decided quantity, in MLflow's alphabet."""
+    metrics: dict[str, float] = {}
+    for row in comparison.tables["verdict"]:
+        if row["seeds"]:
+            pair = f"difference/{_slug([row['group']])} over {_slug([row['other']])}"
+            metrics |= {pair: row["difference"], f"{pair}/decided": float(row["said"] != "not decided")}
+    return metrics
 
 
 def _print(comparison: Comparison) -> None:
-    header, *rows = plain("evaluation", comparison.tables["evaluation"])
-    table = Table(*header, title=f"evaluation after the last step, by {', '.join(comparison.by)}")
-    for column in table.columns[1:]:
-        column.justify = "right"
-    for row in rows:
-        table.add_row(*map(Text, row))
     console = Console(highlight=False)
     console = Console(highlight=False, width=max(console.width, 160))
-    console.print(table)
+    for name, title in (("scores", "scores"), ("evaluation", "episodes")):
+        header, *rows = plain(name, comparison.tables[name])
+        table = Table(*header, title=f"{title} after the last step, by {', '.join(comparison.by)}")
+        for column in table.columns[1:]:
+            column.justify = "right"
+        for row in rows:
+            table.add_row(*map(Text, row))
+        console.print(table)
     for note in comparison.notes:
         console.print(f"- {note}", markup=False)
-    console.print(f"\n{comparison.verdict}", markup=False)
+    console.print()
+    for each in comparison.answers:
+        console.print(f"By {each.family.name}: {spent(each)}.", markup=False)
+    for sentence in comparison.beside:
+        console.print(f"- {sentence}", markup=False)
+    for sentence in (*reversed(comparison.others), comparison.verdict):
+        console.print(f"\n{sentence}", markup=False)
 
 
 def _slug(groups: list[str]) -> str:

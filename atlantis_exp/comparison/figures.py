@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from atlantis_exp.comparison.tables import AXES, Comparison, Table, random_line
+from atlantis_exp.comparison.gather import AXES
+from atlantis_exp.comparison.published import Table, random_line
+from atlantis_exp.comparison.tables import Comparison
 from atlantis_exp.media import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 
 if TYPE_CHECKING:
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
 
 _COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 _LINES = ("-", "--", "-.", ":")
+_GREY = "#6e7781"  # of what is averaged over several groups
 _INK = "#24292f"  # of text and axes; a page lets it follow its own
 _STYLE = {
     **dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), _INK),
@@ -67,12 +70,13 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
                     "Epsilon by emulator frames of training, as in report figure 4.1; at the end: "
                     + _said(groups, rows, "epsilon", ".3f"),
                 )
-    drawn["evaluation"] = _render(
-        partial(_evaluation, comparison=comparison),
-        "Evaluation after the last step",
-        "Interquartile mean, mean and median with 95 % intervals; interquartile means: "
-        + _said(groups, tables["evaluation"], "iqm"),
-        height=1.2 + 0.75 * len(groups),
+    scores = tables["scores"]
+    drawn["scores"] = _render(
+        partial(_scores, comparison=comparison),
+        "Scores",
+        "One dot a seed, the score as a diamond, with its 95 % interval from five seeds on; scores: "
+        + _said([row["group"] for row in scores], scores, "score"),
+        height=1.2 + 0.45 * len(scores),
     )
     drawn["distribution"] = _render(
         partial(_distribution, comparison=comparison),
@@ -83,7 +87,7 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
     drawn["profile"] = _render(
         partial(_profile, comparison=comparison),
         "Share of episodes above a score",
-        "Performance profile: for each score the share of episodes that exceed it, with 95 % bands.",
+        "Performance profile: for each score the share of a group's episodes that exceed it.",
     )
     drawn["actions"] = _render(
         partial(_actions, comparison=comparison),
@@ -172,12 +176,16 @@ def _reference_lines(draw_line: Callable[..., Any], comparison: Comparison, low:
 
 
 def _learning(axes: "Axes", comparison: Comparison, axis: str, rows: Table) -> None:
+    seeds = [row for row in comparison.tables["seed_curves"] if row["axis"] == axis]
     for group in comparison.groups:
         own = [row for row in rows if row["group"] == group]
         x, score, low, high = ([row[key] for row in own] for key in ("x", "score", "low", "high"))
         look = _look(comparison.groups, group)
         axes.plot(x, score, label=group, **look)
         axes.fill_between(x, low, high, color=look["color"], alpha=0.2, linewidth=0)
+        for run in dict.fromkeys(row["run"] for row in seeds if row["group"] == group):
+            points = [(row["x"], row["score"]) for row in seeds if row["run"] == run]
+            axes.plot(*zip(*points, strict=True), linewidth=0.6, alpha=0.6, **look)
     if axis == "frames":
         curves = defaultdict(list)
         for row in comparison.tables["published_curves"]:
@@ -186,7 +194,7 @@ def _learning(axes: "Axes", comparison: Comparison, axis: str, rows: Table) -> N
             axes.plot(
                 *zip(*points, strict=True), color="#8c8c8c", marker=".", linewidth=0.8, label=f"{name}, published"
             )
-    scores = [row[key] for row in rows for key in ("low", "high")]
+    scores = [row["score"] for row in (*rows, *seeds)]
     _reference_lines(axes.axhline, comparison, min(scores), max(scores))
     axes.set_ylim(0, None)
     axes.set_xlabel(_UNITS[axis])
@@ -212,29 +220,26 @@ def _exploration(axes: "Axes", comparison: Comparison, rows: Table) -> None:
     _legend(axes)
 
 
-def _evaluation(axes: "Axes", comparison: Comparison) -> None:
-    table = comparison.tables["evaluation"]
-    for index, row in enumerate(table):
-        for offset, (statistic, marker) in enumerate((("iqm", "o"), ("mean", "s"), ("median", "D"))):
-            y = index + 0.22 * (offset - 1)
-            low, high = row[f"{statistic}_low"], row[f"{statistic}_high"]
-            look = _look(comparison.groups, row["group"])["color"]
-            axes.plot([low, high], [y, y], color=look, linewidth=3, alpha=0.45, solid_capstyle="butt")
-            axes.plot(row[statistic], y, marker, color=look, markersize=6)
-            axes.annotate(
-                f"{'IQM' if statistic == 'iqm' else statistic} {row[statistic]:,.0f}",
-                (high, y),
-                xytext=(6, 0),
-                textcoords="offset points",
-                va="center",
-                fontsize=8,
-            )
-    ends = [row[f"{name}_{end}"] for row in table for name in ("iqm", "mean", "median") for end in ("low", "high")]
+def _scores(axes: "Axes", comparison: Comparison) -> None:
+    table = comparison.tables["scores"]
+    for y, row in enumerate(table):
+        group = row["group"]
+        colour = _look(comparison.groups, group)["color"] if group in comparison.groups else _GREY
+        of_row = [
+            seed for seed in comparison.tables["seeds"] if (seed["family"], seed["group"]) == (row["family"], group)
+        ]
+        axes.plot([row["low"], row["high"]], [y, y], color=colour, linewidth=3, alpha=0.45, solid_capstyle="butt")
+        axes.plot([seed["score"] for seed in of_row], [y] * len(of_row), "o", color=colour, markersize=4, alpha=0.5)
+        axes.plot(row["score"], y, "D", color=colour, markersize=6)
+        axes.annotate(
+            f"{row['score']:,.0f}", (row["score"], y), (0, 6), textcoords="offset points", ha="center", fontsize=8
+        )
+    ends = [seed["score"] for seed in comparison.tables["seeds"]]
     _reference_lines(axes.axvline, comparison, min(ends), max(ends))
-    axes.margins(x=0.15)
+    axes.margins(x=0.1)
     axes.set_yticks(range(len(table)), [row["group"] for row in table])
-    axes.set_ylim(len(table) - 0.4, -0.6)
-    axes.set_xlabel("score")
+    axes.set_ylim(len(table) - 0.4, -0.8)
+    axes.set_xlabel("score, one dot a seed")
     _thousands(axes.xaxis)
     _legend(axes)
 
@@ -259,10 +264,8 @@ def _distribution(axes: "Axes", comparison: Comparison) -> None:
 def _profile(axes: "Axes", comparison: Comparison) -> None:
     for group in comparison.groups:
         rows = [row for row in comparison.tables["profile"] if row["group"] == group]
-        tau, share, low, high = ([row[key] for row in rows] for key in ("tau", "share", "low", "high"))
-        look = _look(comparison.groups, group)
-        axes.plot(tau, share, label=group, **look)
-        axes.fill_between(tau, low, high, color=look["color"], alpha=0.2, linewidth=0)
+        tau, share = ([row[key] for row in rows] for key in ("tau", "share"))
+        axes.plot(tau, share, label=group, **_look(comparison.groups, group))
     axes.set_xscale("log")
     _thousands(axes.xaxis)
     axes.set_xlabel("score (logarithmic)")

@@ -1,8 +1,9 @@
 """Run folders to runs that can be compared; what cannot be is named with its reason."""
 
 import json
+import mmap
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -16,7 +17,7 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.folder import EVALUATION, RESULT, RunFolder, evaluation_at
-from atlantis_exp.runs.journal import Metrics, Tags, curve, read
+from atlantis_exp.runs.journal import Tags, curve, read, read_commit
 
 Array = npt.NDArray[np.float64]
 
@@ -26,6 +27,9 @@ PROTOCOL = (
 )
 """What must be equal for scores to mean the same; the observation's size belongs to the network."""
 
+AXES = {"frames": "equal frames", "hours": "equal hours", "flops": "equal gradient FLOPs"}
+"""The three fair views: column of a learning curve to what is equal."""
+
 _CURVE = {
     "frames": "throughput/frames",
     "hours": "throughput/hours",
@@ -34,6 +38,10 @@ _CURVE = {
     "score": "score/mean_100",
 }
 _POINT = ("throughput/frames", "score/mean_100")  # what tells a point of the curve from other metrics
+
+COMMIT = "git.commit"
+"""The key whose values are commits."""
+_COMMIT_DIGITS = 10
 
 _PLAYERS = ("agent", "player")  # the config's key of what has no network: a baseline, a person
 
@@ -47,6 +55,18 @@ class Training:
     science: dict[str, Any]  # the dotted keys that decide its numbers
     curve: dict[str, Array]  # frames, hours, flops (where recorded), epsilon, score (mean of the last 100 episodes)
     episodes: EpisodeTable
+    tags: dict[str, str]  # what the run says about itself: device, precision, git.commit, versions
+    policy: str  # in words, what the network did most in these episodes; empty where nobody said
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """All that runs can be told apart by: the config and, where it has no such key, the tags."""
+        return {**self.tags, **self.config}
+
+    @property
+    def has_collapsed(self) -> bool:
+        """Whether the network chose one action only."""
+        return self.policy.startswith("collapsed")
 
 
 @dataclass(frozen=True)
@@ -71,11 +91,12 @@ class _Unusable(ValueError):
     """A run that cannot be compared, and why."""
 
 
-def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None) -> Gathered:
+def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None, put_aside: bool = False) -> Gathered:
     """Read all finished runs under `outputs`, or those whose name begins with or fits one of the patterns `runs`.
 
     A training's episodes are those of its latest evaluation after its last step, be it the training's own or one that
-    the verb `evaluate` made; given `epsilon`, of the latest at that epsilon.
+    the verb `evaluate` made; given `epsilon`, of the latest at that epsilon. What resume=never put aside is left out
+    unless it is asked for, as it is where commits are compared: it is what an earlier one made of the same recipe.
     """
     evaluations = _evaluations(outputs)
     gathered = Gathered()
@@ -83,7 +104,7 @@ def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None
         if runs and not any(fnmatchcase(folder.name, f"{pattern}*") for pattern in runs):
             continue
         try:
-            tree = _config(folder)
+            tree = _config(folder, put_aside)
             if any(key in tree for key in _PLAYERS):
                 gathered.players.append(
                     Player(folder.name, flatten(tree), EpisodeTable.read(folder.artifact(EVALUATION)))
@@ -105,12 +126,12 @@ def select(trainings: Iterable[Training], where: Sequence[str]) -> list[Training
         if not equals:
             raise ConfigError(f"where={text}: write KEY=VALUE, as in where=model=cnn,seed=0")
         _check_key("where", key, selected)
-        selected = [run for run in selected if value in _spellings(run.config.get(resolve(key, run.config)))]
+        selected = [run for run in selected if value in _spellings(run.facts.get(resolve(key, run.facts)))]
     return selected
 
 
 def group(trainings: Iterable[Training], by: Sequence[str]) -> dict[str, list[Training]]:
-    """Trainings by the values of config keys, `model` being short for `model.name`; groups in order of their labels.
+    """Trainings by the values of config keys or tags, `model` being short for `model.name`; in order of their labels.
 
     Raises:
         ConfigError: on a key that no training has.
@@ -120,13 +141,24 @@ def group(trainings: Iterable[Training], by: Sequence[str]) -> dict[str, list[Tr
         _check_key("by", key, trainings)
     groups = defaultdict(list)
     for training in trainings:
-        parts = []
-        for key in by:
-            name = resolve(key, training.config)
-            value = training.config.get(name)
-            parts.append(value if isinstance(value, str) else f"{name.rsplit('.')[-1] or key}={json.dumps(value)}")
-        groups[" ".join(parts) or "all"].append(training)
+        groups[" ".join(values_of(training, by)) or "all"].append(training)
     return dict(sorted(groups.items()))
+
+
+def values_of(training: Training, by: Sequence[str]) -> tuple[str, ...]:
+    """How people call a training's value of each key; a commit by its first digits."""
+    return values_in(training.facts, by)
+
+
+def values_in(facts: Mapping[str, Any], by: Sequence[str]) -> tuple[str, ...]:
+    """How people call the value of each key in a training's facts."""
+    values = []
+    for key in by:
+        name = resolve(key, facts)
+        value = facts.get(name)
+        text = value if isinstance(value, str) else f"{name.rsplit('.')[-1] or key}={json.dumps(value)}"
+        values.append(text[:_COMMIT_DIGITS] if name == COMMIT else text)
+    return tuple(values)
 
 
 def resolve(key: str, config: Mapping[str, Any]) -> str:
@@ -162,8 +194,8 @@ def plays_alike(player: Player, training: Training) -> bool:
 
 
 def _check_key(option: str, key: str, trainings: Sequence[Training]) -> None:
-    if trainings and not any(resolve(key, training.config) for training in trainings):
-        raise ConfigError(f"{option}={key}: no such key; {nearest(key, {k for run in trainings for k in run.config})}")
+    if trainings and not any(resolve(key, training.facts) for training in trainings):
+        raise ConfigError(f"{option}={key}: no such key; {nearest(key, {k for run in trainings for k in run.facts})}")
 
 
 def _spellings(value: Any) -> tuple[str, str]:
@@ -171,9 +203,9 @@ def _spellings(value: Any) -> tuple[str, str]:
     return str(value), json.dumps(value)
 
 
-def _config(folder: RunFolder) -> dict[str, Any]:
+def _config(folder: RunFolder, put_aside: bool) -> dict[str, Any]:
     """The config of a folder that holds a finished run of ours."""
-    if "~" in folder.name:
+    if "~" in folder.name and not put_aside:
         raise _Unusable("put aside by resume=never")
     if not folder.has_started:
         raise _Unusable("foreign: it has no config.json")
@@ -193,35 +225,58 @@ def _training(
 ) -> Training:
     points = np.array([[record.values[key] for key in _CURVE.values()] for record in curve(folder.path, _POINT)])
     arrays = dict(zip(_CURVE, points.T, strict=True)) if len(points) else {}
-    if (updates := arrays.pop("updates", None)) is not None and (flops := _flops_per_update(folder.path)) is not None:
-        arrays["flops"] = updates * flops
+    tags = _tags(folder.path)
+    if (updates := arrays.pop("updates", None)) is not None and "flops_per_update" in tags:
+        arrays["flops"] = updates * float(tags["flops_per_update"])
 
     assert folder.result is not None
     steps = folder.result.steps
-    tables = [(config.evaluation.epsilon, folder.artifact(evaluation_at(steps)))]
+    tables = [(config.evaluation.epsilon, folder, folder.artifact(evaluation_at(steps)))]
     tables += [
-        (facts["evaluation"]["epsilon"], run.artifact(EVALUATION))
+        (facts["evaluation"]["epsilon"], run, run.artifact(EVALUATION))
         for _, facts, run in sorted(evaluations, key=lambda evaluation: evaluation[0])
         if facts["step"] == steps
     ]
-    tables = [(value, path) for value, path in tables if path.exists() and epsilon in (None, value)]
+    tables = [table for table in tables if table[2].exists() and epsilon in (None, table[0])]
     if not tables:
         wanted = "" if epsilon is None else f" at epsilon {epsilon}"
         raise _Unusable(f"no evaluation{wanted} after its last step: evaluate run={folder.name} makes one")
-    taken, path = tables[-1]
+    taken, player, path = tables[-1]
+    policy = (tags if player == folder else _tags(player.path)).get("policy", "")
     science = config.science()
     science["phase"] = {str(index): phase for index, phase in enumerate(science["phase"])}
     leaves = flatten(to_dict(config)) | {"evaluation.epsilon": taken}
-    return Training(folder.name, leaves, flatten(science), arrays, EpisodeTable.read(path))
+    episodes = EpisodeTable.read(path)
+    if not np.isfinite(episodes.scores).all():
+        raise ValueError(f"{path} has a score that is no finite number")
+    return Training(folder.name, leaves, flatten(science), arrays, episodes, tags, policy)
 
 
-def _flops_per_update(folder: Path) -> float | None:
-    for _, record in read(folder):
-        if isinstance(record, Tags) and "flops_per_update" in record.values:
-            return float(record.values["flops_per_update"])
-        if isinstance(record, Metrics):  # it is said before the first
-            break
-    return None
+def _tags(folder: Path) -> dict[str, str]:
+    """What a run's journal says about the run; of a long one no other lines are parsed."""
+    commit = read_commit(folder)
+    tags: dict[str, str] = {}
+    if commit is None or not commit.offset:
+        return tags
+    with (
+        open(folder / "journal.jsonl", "rb") as file,
+        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as journal,
+    ):
+        for start in _tag_lines(journal, commit.offset):
+            for _, record in read(folder, start, start + 1):
+                tags |= record.values if isinstance(record, Tags) else {}
+    return tags
+
+
+def _tag_lines(journal: mmap.mmap, end: int) -> Iterator[int]:
+    """Where the lines with tags begin."""
+    kind = b'{"kind":"tags",'
+    if journal[: len(kind)] == kind:
+        yield 0
+    newline = journal.find(b"\n" + kind, 0, end)
+    while newline >= 0:
+        yield newline + 1
+        newline = journal.find(b"\n" + kind, newline + 1, end)
 
 
 def _evaluations(outputs: Path) -> dict[str, list[tuple[int, dict[str, Any], RunFolder]]]:

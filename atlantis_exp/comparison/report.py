@@ -6,7 +6,8 @@ from importlib.resources import files
 from jinja2 import Environment, StrictUndefined
 
 from atlantis_exp.comparison.figures import Drawn
-from atlantis_exp.comparison.tables import Comparison, Row, Table
+from atlantis_exp.comparison.published import Row, Table
+from atlantis_exp.comparison.tables import Comparison
 
 
 def page(comparison: Comparison, figures: Mapping[str, Drawn], facts: Mapping[str, str]) -> str:
@@ -14,22 +15,51 @@ def page(comparison: Comparison, figures: Mapping[str, Drawn], facts: Mapping[st
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
     template = environment.from_string((files("atlantis_exp.comparison") / "page.html").read_text("utf-8"))
     return template.render(
-        comparison=comparison, tables=comparison.tables, figures=figures, facts=facts, columns=COLUMNS, cells=cells
+        comparison=comparison, tables=comparison.tables, figures=figures, facts=facts, titles=titles, cells=cells
     )
 
 
-_SCORES = {"episodes": "episodes", "iqm": "IQM", "mean": "mean", "median": "median", "low": "low", "high": "high"}
+_EPISODES = {"episodes": "episodes", "mean": "mean", "median": "median", "low": "low", "high": "high"}
+_DIFFERENCE = {"difference": "difference", "said": "verdict"}
 
 COLUMNS = {
+    "scores": {"family": "by", "group": "group", "seeds": "seeds", "score": "score", **_DIFFERENCE},
+    "verdict": {"family": "by", "group": "group", "other": "against", **_DIFFERENCE, "seeds": "seeds each"},
+    "plan": {
+        "family": "by",
+        "planned": "looks planned at",
+        "taken": "taken at",
+        "next_look": "next look at",
+        "spent": "error spent",
+        "error": "of",
+    },
+    "looks": {
+        "family": "by",
+        "look": "look",
+        "seeds": "seeds each",
+        "spent": "error spent",
+        "group": "group",
+        "other": "against",
+        **_DIFFERENCE,
+    },
     "evaluation": {
         "group": "group",
         "runs": "runs",
-        **_SCORES,
-        "score_per_1000_steps": "score / 1,000 steps",
+        **_EPISODES,
+        "points_per_frame": "points per frame",
         "time_cap_share": "at time cap",
         "human_normalised_mean": "human-normalised",
     },
-    "verdict": {
+    "modes": {
+        "group": "group",
+        "seeds": "seeds",
+        "upper_share": "in the upper mode",
+        "upper_score": "score of those",
+        "lower_score": "of the others",
+        "time_cap_share": "episodes at time cap",
+        "points_per_frame": "points per frame",
+    },
+    "views": {
         "view": "view",
         "at": "up to",
         "leader": "leader",
@@ -37,8 +67,6 @@ COLUMNS = {
         "other": "other",
         "other_score": "its score",
         "difference": "difference",
-        "decided": "decided",
-        "more_seeds": "more seeds",
     },
     "improvement": {"group": "group", "over": "over", "probability": "probability of improvement"},
     "runs": {
@@ -49,7 +77,10 @@ COLUMNS = {
         "hours": "hours",
         "flops": "FLOPs",
         "epsilon": "epsilon",
-        **_SCORES,
+        "score": "score",
+        **_EPISODES,
+        "policy": "policy",
+        "same_as": "counts as one with",
     },
     "actions": {"group": "group", "action": "action", "network": "network", "random": "chance"},
     "references": {"name": "player", "score": "score", "protocol": "protocol", "source": "source"},
@@ -57,33 +88,56 @@ COLUMNS = {
 }
 """The tables that the page shows: their columns and how a person calls them."""
 
-_SHARES = {"time_cap_share", "probability", "network", "random", "human_normalised_mean"}
+_SHARES = {
+    *("time_cap_share", "upper_share", "probability", "network", "random", "human_normalised_mean"),
+    *("error", "spent"),
+}
+_ENDS = {
+    ("scores", "score"): ("low", "high"),
+    ("scores", "difference"): ("difference_low", "difference_high"),
+    **{(table, "difference"): ("low", "high") for table in ("verdict", "looks", "views")},
+}
+"""The columns of a table that have an interval, and those of its ends."""
 
 
-def cells(name: str, row: Row) -> list[tuple[str, bool]]:
+def titles(name: str, table: Table) -> list[str]:
+    """The header of a shown table."""
+    return [COLUMNS[name][column] for column in shown_columns(name, table)]
+
+
+def cells(name: str, row: Row, table: Table) -> list[tuple[str, bool]]:
     """A row of a shown table as texts, intervals included, and whether each is a number."""
     texts = []
-    for column in COLUMNS[name]:
+    for column in shown_columns(name, table):
         value = row[column]
         text = number(value, column)
-        low, high = {
-            "probability": ("low", "high"),
-            "difference": ("low", "high"),
-        }.get(column, (f"{column}_low", f"{column}_high"))
-        if low in row and row[low] == row[low]:
+        low, high = _ENDS.get((name, column), ("", ""))
+        if low and row[low] == row[low]:
             text += f" ({number(row[low], column)} to {number(row[high], column)})"
         texts.append((text, isinstance(value, int | float) and not isinstance(value, bool)))
     return texts
 
 
+def shown_columns(name: str, table: Table) -> list[str]:
+    """The columns of a table that are shown: without a baseline no differences to one, of one family not its name."""
+    hidden = set()
+    if name == "scores" and not any(row["baseline"] for row in table):
+        hidden |= {"difference", "said"}
+    if len({row.get("family") for row in table}) == 1:
+        hidden.add("family")
+    return [column for column in COLUMNS[name] if column not in hidden]
+
+
 def number(value: object, column: str = "") -> str:
     """A table's value as a person reads it."""
-    if value is None:
-        return "over 1,000"  # of seeds
     if isinstance(value, bool):
         return "yes" if value else "no"
     if not isinstance(value, int | float):
         return str(value)
+    if value != value:
+        return ""
+    if column in ("error", "spent"):
+        return f"{value:.2%}"
     if column in _SHARES:
         return f"{value:.1%}"
     if column in ("seed", "epsilon"):
@@ -95,4 +149,4 @@ def number(value: object, column: str = "") -> str:
 
 def plain(name: str, table: Table) -> list[list[str]]:
     """A shown table as texts, header first."""
-    return [list(COLUMNS[name].values()), *([text for text, _ in cells(name, row)] for row in table)]
+    return [titles(name, table), *([text for text, _ in cells(name, row, table)] for row in table)]

@@ -1,43 +1,26 @@
-"""Runs to tables and a verdict: every number that a figure or the page shows is in one of the tables."""
+"""Runs to tables and answers: every number that a figure or the page shows is in one of the tables."""
 
 import csv
 import io
-import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
-from atlantis_exp.comparison.gather import Array, Gathered, Player, Training, plays_alike, resolve
-from atlantis_exp.statistics import (
-    EARLY_FRAMES,
-    FEWEST_SEEDS,
-    RANDOM_SCORE,
-    Scores,
-    difference,
-    human_normalised,
-    interquartile_mean,
-    interval,
-    probability_of_improvement,
-    resample,
-    summarize,
-)
+from atlantis_exp.comparison.gather import AXES, Array, Gathered, Player, Training, plays_alike
+from atlantis_exp.comparison.notes import BESIDE, NOTES, Facts
+from atlantis_exp.comparison.published import Row, Table, literature
+from atlantis_exp.comparison.verdict import Answer, Question, answer, counted, families, group_of
+from atlantis_exp.comparison.words import said
+from atlantis_exp.decision import FEWEST_SEEDS, Look, Plan, Verdict, decide, mean_interval, modes
+from atlantis_exp.statistics import Scores, human_normalised, probability_of_improvement, summarize
 
-Row = dict[str, Any]
-Table = list[Row]
 Groups = Mapping[str, Sequence[Training]]
 
-AXES = {"frames": "equal frames", "hours": "equal hours", "flops": "equal gradient FLOPs"}
-"""The three fair views: column of a learning curve to what is equal."""
-
 _GRID = 100  # points of a curve
-_MOST_DRAWN = 40_000_000  # scores in all bootstrap samples together: 320 MB
-_FEWEST_SAMPLES = 200
-_HELD = 2_000.0  # what any one action scores when it is held
+_NAN = float("nan")
 
 
 @dataclass(frozen=True)
@@ -46,48 +29,74 @@ class Comparison:
 
     groups: list[str]
     by: list[str]
-    verdict: str
+    answers: list[Answer]
+    verdict: str  # the answer to what is asked first
+    others: list[str]  # the answers to the rest of the question
+    beside: list[str]  # what can make a verdict mean something else
     notes: list[str]
     tables: dict[str, Table]
 
 
-def compare(gathered: Gathered, groups: Groups, by: Sequence[str], resamples: int, seed: int) -> Comparison:
-    """Compare groups of trainings; intervals are 95 % bootstrap intervals of `resamples` samples drawn from `seed`.
+def compare(
+    gathered: Gathered,
+    groups: Groups,
+    question: Question,
+    record: Mapping[str, Sequence[Look]] | None = None,
+    now: bool = False,
+) -> Comparison:
+    """Compare groups of trainings, taking the looks that are due, or with `now` one that is not.
 
-    Of very many episodes there are fewer, see `fewer_samples`.
+    Args:
+        record: the looks taken before, by family.
+
+    Raises:
+        ConfigError: for a baseline that is none of what is compared.
     """
-    rng = np.random.default_rng(seed)
-    resamples = fewer_samples(groups, resamples)
-    samples = {
-        label: resample([training.episodes.scores for training in runs], resamples, rng)
-        for label, runs in groups.items()
-    }
-    views = _views(groups)
+    scores = [group_of(runs, question.by) for runs in groups.values()]
+    answers = answer(families(scores, question), record or {}, now)
     trainings = [training for runs in groups.values() for training in runs]
     players = [player for player in gathered.players if plays_alike(player, trainings[0])]
-    evaluation = [_evaluation(label, runs, samples[label]) for label, runs in groups.items()]
     frames = max((training.curve["frames"][-1] for training in trainings if training.curve), default=0.0)
+    by_label = {group.label: group.seeds for group in scores}
+    named: list[tuple[str, dict[str, dict[int, float]], Answer | None]] = [
+        (each.family.name, each.family.seeds, each) for each in answers
+    ] or [("all", by_label, None)]
+    evaluation = [_evaluation(label, runs) for label, runs in groups.items()]
     tables: dict[str, Table] = {
-        "verdict": views,
+        "scores": [row for family in named for row in _scores(*family)],
+        "seeds": [
+            {"family": name, "group": value, "seed": seed, "score": score}
+            for name, values, _ in named
+            for value, seeds in values.items()
+            for seed, score in seeds.items()
+        ],
+        "verdict": [row for each in answers for row in _verdicts(each)],
+        "plan": [_plan(each) for each in answers],
+        "looks": [row for each in answers for row in _looks(each)],
         "evaluation": evaluation,
-        "improvement": _improvement(groups, samples),
-        "runs": [_run(label, training) for label, runs in groups.items() for training in runs],
-        "curves": [row for axis in AXES for label, runs in groups.items() for row in _curve(axis, label, runs, rng)],
-        "profile": _profile(groups, samples),
+        "modes": [row for row in evaluation for row in _modes(row, by_label[row["group"]])],
+        "improvement": _improvement(groups),
+        "views": _views(groups),
+        "runs": [row for label, runs in groups.items() for row in _runs(label, runs)],
+        "curves": [row for axis in AXES for label, runs in groups.items() for row in _curve(axis, label, runs)],
+        "seed_curves": [
+            row for axis in AXES for label, runs in groups.items() for row in _seed_curves(axis, label, runs)
+        ],
+        "profile": _profile(groups),
         "actions": [row for label, runs in groups.items() for row in _actions(label, runs)],
         "episodes": [row for label, runs in groups.items() for training in runs for row in _episodes(label, training)],
         "references": [_measured(player) for player in players] + literature("scores"),
         "published_curves": [row for row in literature("curves") if row["frames"] <= frames],
         "skipped": [{"run": name, "reason": reason} for name, reason in gathered.skipped.items()],
     }
-    notes = _notes(groups, by, views, evaluation, random_line(tables["references"]), frames)
-    return Comparison(list(groups), list(by), _verdict(views, groups), notes, tables)
-
-
-def fewer_samples(groups: Groups, resamples: int) -> int:
-    """As many bootstrap samples as are asked for, but of very many episodes fewer, so that all fit into memory."""
-    episodes = sum(training.episodes.scores.size for runs in groups.values() for training in runs)
-    return min(resamples, max(_FEWEST_SAMPLES, _MOST_DRAWN // episodes))
+    facts = Facts(groups, question.by, answers, tables, float(frames))
+    beside, notes = ([line for note in notes for line in note(facts)] for notes in (BESIDE, NOTES))
+    if now and answers and all(each.taken is None for each in answers):
+        beside.append("look=now took no look: no group that is undecided has new seeds, or one has fewer than five.")
+    if training := _in_training(tables["views"]):
+        notes.insert(0, training)
+    verdict, *others = _sentences(answers, list(groups))
+    return Comparison(list(groups), list(question.by), answers, verdict, others, beside, notes, tables)
 
 
 def to_csv(table: Table) -> str:
@@ -100,115 +109,212 @@ def to_csv(table: Table) -> str:
     return text.getvalue()
 
 
-def literature(name: str) -> Table:
-    """The published `scores` (players and algorithms) or learning `curves` that ship with the package, with sources."""
-    text = (files("atlantis_exp.comparison") / f"published_{name}.csv").read_text("utf-8")
-    table: Table = list(csv.DictReader(io.StringIO(text)))
-    for row in table:
-        for key in {"score", "mean", "low", "high", "seeds"} & row.keys():
-            row[key] = float(row[key])
-        if "frames_millions" in row:
-            row["frames"] = 1e6 * float(row.pop("frames_millions"))
+def _sentences(answers: Sequence[Answer], groups: Sequence[str]) -> list[str]:
+    """The answer of each family."""
+    if not answers:
+        return [f"There is one group only ({groups[0]}), so there is nothing to compare; by=KEY splits it."]
+    if len(answers) == 1:
+        return [said(answers[0])]
+    return [f"By {each.family.name}: {said(each)}" for each in answers]
+
+
+def _scores(family: str, values: Mapping[str, Mapping[int, float]], answer: Answer | None) -> Table:
+    """The score of each value of a family, and the difference to the baseline where it has one."""
+    baseline = answer.family.plan.baseline if answer else None
+    found = {verdict.group: verdict for verdict in answer.decision.verdicts} if answer and baseline else {}
+    table = []
+    for value, seeds in values.items():
+        score = float(np.mean(list(seeds.values()))) if seeds else _NAN
+        low, high = _mean_interval(list(seeds.values()))
+        verdict = found.get(value, Verdict(value, baseline or ""))
+        table.append(
+            {
+                "family": family,
+                "group": value,
+                "seeds": len(seeds),
+                "score": score,
+                "low": low,
+                "high": high,
+                "baseline": baseline or "",
+                "difference": verdict.difference,
+                "difference_low": verdict.low,
+                "difference_high": verdict.high,
+                "said": verdict.said if value in found else "",
+            }
+        )
     return table
 
 
-def random_line(references: Table) -> Row:
-    """The random player measured under the runs' own settings, else the published one."""
-    return next(row for row in references if row["name"].startswith("random"))
+def _mean_interval(seeds: Sequence[float] | Array) -> tuple[float, float]:
+    """Student's interval from `FEWEST_SEEDS` on; of fewer seeds no interval is to be trusted, so NaN."""
+    return mean_interval(seeds) if len(seeds) >= FEWEST_SEEDS else (_NAN, _NAN)
+
+
+def _verdicts(answer: Answer) -> Table:
+    return [{"family": answer.family.name, **_verdict(verdict)} for verdict in answer.decision.verdicts]
+
+
+def _verdict(verdict: Verdict) -> Row:
+    return {
+        "group": verdict.group,
+        "other": verdict.other,
+        "said": verdict.said,
+        "difference": verdict.difference,
+        "low": verdict.low,
+        "high": verdict.high,
+        "seeds": verdict.seeds,
+        "detectable": _NAN if verdict.detectable is None else verdict.detectable,
+    }
+
+
+def _plan(answer: Answer) -> Row:
+    plan, decision = answer.family.plan, answer.decision
+    return {
+        "family": answer.family.name,
+        "planned": " ".join(map(str, plan.looks)),
+        "taken": " ".join(str(look.size) for look in decision.looks),
+        "error": plan.error,
+        "spent": decision.spent,
+        "next_look": decision.next_look or "",
+    }
+
+
+def _looks(answer: Answer) -> Table:
+    """The intervals as they shrank: one row a look and pair."""
+    return [
+        {"family": answer.family.name, "look": index, "spent": look.error, **_verdict(verdict)}
+        for index, look in enumerate(answer.decision.looks, 1)
+        for verdict in look.verdicts
+    ]
 
 
 def _pooled(runs: Sequence[Training]) -> Scores:
     return np.concatenate([training.episodes.scores for training in runs])
 
 
-def _mean(scores: Scores) -> float:
-    return float(scores.mean())
-
-
-def _median(scores: Scores) -> float:
-    return float(np.median(scores))
-
-
-def _evaluation(label: str, runs: Sequence[Training], samples: Sequence[Scores]) -> Row:
-    scores = _pooled(runs)
-    row: Row = {"group": label, "runs": len(runs), "episodes": scores.size}
-    for name, statistic in (("iqm", interquartile_mean), ("mean", _mean), ("median", _median)):
-        low, high = interval([statistic(sample) for sample in samples])
-        row |= {name: statistic(scores), f"{name}_low": float(low), f"{name}_high": float(high)}
-    steps = np.concatenate([training.episodes.steps for training in runs])
+def _evaluation(label: str, runs: Sequence[Training]) -> Row:
+    """What the episodes of a group are like, those of runs that count as one seed once."""
+    runs = counted(runs)[0]
+    summary = summarize(_pooled(runs))
+    frames = np.concatenate([training.episodes.frames for training in runs])
     truncated = np.concatenate([training.episodes.truncated for training in runs])
-    return row | {
-        "low": float(scores.min()),
-        "high": float(scores.max()),
-        "score_per_1000_steps": float(1_000 * scores.sum() / steps.sum()),
-        "time_cap_share": float(truncated.mean()),
-        "human_normalised_mean": human_normalised(float(scores.mean())),
-    }
-
-
-def _run(label: str, training: Training) -> Row:
-    summary = summarize(training.episodes.scores)
-    last = {axis: training.curve[axis][-1] if axis in training.curve else "" for axis in AXES}
     return {
-        "run": training.name,
         "group": label,
-        "seed": training.config["seed"],
-        **last,
-        "epsilon": training.config["evaluation.epsilon"],
+        "runs": len(runs),
         "episodes": summary.episodes,
-        "iqm": summary.interquartile_mean,
         "mean": summary.mean,
         "median": summary.median,
         "low": summary.low,
         "high": summary.high,
+        "points_per_frame": float(_pooled(runs).sum() / frames.sum()) if frames.sum() else _NAN,
+        "time_cap_share": float(truncated.mean()),
+        "human_normalised_mean": human_normalised(summary.mean),
     }
 
 
-def _improvement(groups: Groups, samples: Mapping[str, Sequence[Scores]]) -> Table:
+def _modes(evaluation: Row, seeds: Mapping[int, float]) -> Table:
+    """One row where a group's seeds fall into two modes: how many survive, beside what those score."""
+    found = modes(list(seeds.values()))
+    if found is None:
+        return []
+    return [
+        {
+            "group": evaluation["group"],
+            "seeds": len(seeds),
+            "upper_share": found.share,
+            "upper_score": found.upper,
+            "lower_score": found.lower,
+            "time_cap_share": evaluation["time_cap_share"],
+            "points_per_frame": evaluation["points_per_frame"],
+        }
+    ]
+
+
+def _runs(label: str, runs: Sequence[Training]) -> Table:
+    same = counted(runs)[1]
     table = []
-    for one, other in combinations(groups, 2):
-        estimates = [probability_of_improvement(*pair) for pair in zip(samples[one], samples[other], strict=True)]
-        low, high = interval(estimates)
-        probability = probability_of_improvement(_pooled(groups[one]), _pooled(groups[other]))
-        table.append({"group": one, "over": other, "probability": probability, "low": float(low), "high": float(high)})
+    for training in runs:
+        summary = summarize(training.episodes.scores)
+        last = {axis: training.curve[axis][-1] if axis in training.curve else "" for axis in AXES}
+        table.append(
+            {
+                "run": training.name,
+                "group": label,
+                "seed": training.config["seed"],
+                **last,
+                "epsilon": training.config["evaluation.epsilon"],
+                "episodes": summary.episodes,
+                "score": summary.interquartile_mean,
+                "mean": summary.mean,
+                "median": summary.median,
+                "low": summary.low,
+                "high": summary.high,
+                "policy": training.policy,
+                "same_as": same[training.name].name if training.name in same else "",
+            }
+        )
     return table
 
 
-def _curve(axis: str, label: str, runs: Sequence[Training], rng: np.random.Generator) -> Table:
-    """The mean over runs as far as all of them go, with a bootstrap band over runs where there are several."""
-    if not all(axis in training.curve for training in runs):
+def _improvement(groups: Groups) -> Table:
+    return [
+        {
+            "group": one,
+            "over": other,
+            "probability": probability_of_improvement(_pooled(groups[one]), _pooled(groups[other])),
+        }
+        for one, other in combinations(groups, 2)
+    ]
+
+
+def _curve(axis: str, label: str, runs: Sequence[Training]) -> Table:
+    """The mean over runs as far as all of them go, with its interval where there are seeds enough."""
+    if (grid := _grid(axis, runs)) is None:
         return []
-    first = max(training.curve[axis][0] for training in runs)
-    last = min(training.curve[axis][-1] for training in runs)
-    if last <= first:
-        return []
-    grid = np.linspace(first, last, _GRID)
     scores = np.array([_at(training, axis, grid) for training in runs])
     epsilons = np.mean([_at(training, axis, grid, "epsilon") for training in runs], axis=0)
-    drawn = rng.multinomial(len(runs), np.full(len(runs), 1 / len(runs)), size=2_000)  # how often each run is
-    low, high = interval(drawn @ scores / len(runs))
+    bounds = [_mean_interval(column) for column in scores.T]
     return [
-        {"axis": axis, "group": label, "x": x, "score": score, "low": under, "high": over, "epsilon": epsilon}
-        for x, score, under, over, epsilon in np.stack(
-            (grid, scores.mean(axis=0), low, high, epsilons), axis=1
-        ).tolist()
+        {"axis": axis, "group": label, "x": x, "score": score, "low": low, "high": high, "epsilon": epsilon}
+        for x, score, (low, high), epsilon in zip(
+            grid.tolist(), scores.mean(axis=0).tolist(), bounds, epsilons.tolist(), strict=True
+        )
     ]
+
+
+def _seed_curves(axis: str, label: str, runs: Sequence[Training]) -> Table:
+    """The curves of a group's several runs, where they are too few for an interval."""
+    if not 1 < len(runs) < FEWEST_SEEDS or (grid := _grid(axis, runs)) is None:
+        return []
+    return [
+        {"axis": axis, "group": label, "run": training.name, "x": x, "score": score}
+        for training in runs
+        for x, score in zip(grid.tolist(), _at(training, axis, grid).tolist(), strict=True)
+    ]
+
+
+def _grid(axis: str, runs: Sequence[Training]) -> Array | None:
+    """Where all runs have a curve; None where they have none in common."""
+    if not all(axis in training.curve for training in runs):
+        return None
+    first = max(training.curve[axis][0] for training in runs)
+    last = min(training.curve[axis][-1] for training in runs)
+    return np.linspace(first, last, _GRID) if last > first else None
 
 
 def _at(training: Training, axis: str, x: float | Array, measure: str = "score") -> Array:
     return np.asarray(np.interp(x, training.curve[axis], training.curve[measure]), np.float64)
 
 
-def _profile(groups: Groups, samples: Mapping[str, Sequence[Scores]]) -> Table:
+def _profile(groups: Groups) -> Table:
     """The share of episodes that score more than tau (Agarwal et al. 2021), for tau over all scores."""
     scores = np.concatenate([_pooled(runs) for runs in groups.values()])
     taus = np.unique(np.geomspace(max(scores.min() / 2, 100.0), max(scores.max(), 200.0), _GRID))
-    table = []
-    for label, runs in groups.items():
-        low, high = interval([_shares(sample, taus) for sample in samples[label]])
-        rows = zip(taus.tolist(), _shares(_pooled(runs), taus).tolist(), low.tolist(), high.tolist(), strict=True)
-        table += [{"group": label, "tau": tau, "share": share, "low": a, "high": b} for tau, share, a, b in rows]
-    return table
+    return [
+        {"group": label, "tau": tau, "share": share}
+        for label, runs in groups.items()
+        for tau, share in zip(taus.tolist(), _shares(_pooled(runs), taus).tolist(), strict=True)
+    ]
 
 
 def _shares(scores: Scores, taus: Scores) -> Scores:
@@ -258,135 +364,65 @@ def _measured(player: Player) -> Row:
 
 
 def _views(groups: Groups) -> Table:
-    """The leader against the runner-up in the evaluation and in the three fair views, by one value a run."""
+    """The leader in each of the three fair views against each other group, where the shortest run ends.
+
+    Descriptions: no look is spent on them. The intervals are those of one look at all pairs, whoever leads.
+    """
     table: Table = []
-    if len(groups) < 2:
-        return table
-    values = {
-        label: [interquartile_mean(training.episodes.scores) for training in runs] for label, runs in groups.items()
-    }
-    table.append(_view("evaluation", "", values))
-    for axis, name in AXES.items():
-        trainings = [training for runs in groups.values() for training in runs]
-        if not all(axis in training.curve for training in trainings):
+    trainings = [training for runs in groups.values() for training in runs]
+    for axis, name in AXES.items() if len(groups) > 1 else ():
+        if (grid := _grid(axis, trainings)) is None:
             continue
-        shortest = min(float(training.curve[axis][-1]) for training in trainings)
-        if shortest <= max(float(training.curve[axis][0]) for training in trainings):
-            continue
-        values = {label: [float(_at(run, axis, shortest)) for run in runs] for label, runs in groups.items()}
-        table.append(_view(name, shortest, values))
+        shortest = float(grid[-1])
+        values = {label: _one_a_seed(runs, axis, shortest) for label, runs in groups.items()}
+        means = {label: float(np.mean(list(seeds.values()))) for label, seeds in values.items()}
+        intervals = _at_once(values)
+        leader, *others = sorted(means, key=lambda label: -means[label])
+        for other in others:
+            low, high = intervals.get((leader, other), (_NAN, _NAN))
+            table.append(
+                {
+                    "view": name,
+                    "at": shortest,
+                    "leader": leader,
+                    "leader_score": means[leader],
+                    "other": other,
+                    "other_score": means[other],
+                    "difference": means[leader] - means[other],
+                    "low": low,
+                    "high": high,
+                }
+            )
     return table
 
 
-def _view(name: str, at: float | str, values: Mapping[str, Sequence[float]]) -> Row:
-    leader, other = sorted(values, key=lambda label: -float(np.mean(values[label])))[:2]
-    found = difference(values[leader], values[other])
-    return {
-        "view": name,
-        "at": at,
-        "leader": leader,
-        "other": other,
-        "leader_score": float(np.mean(values[leader])),
-        "other_score": float(np.mean(values[other])),
-        "difference": found.value,
-        "low": found.low,
-        "high": found.high,
-        "decided": found.is_decided,
-        "more_seeds": found.more_seeds,
-    }
+def _one_a_seed(runs: Sequence[Training], axis: str, x: float) -> dict[int, float]:
+    values = defaultdict(list)
+    for training in runs:
+        values[int(training.config["seed"])].append(float(_at(training, axis, x)))
+    return {seed: float(np.mean(found)) for seed, found in values.items()}
 
 
-def _verdict(views: Table, groups: Groups) -> str:
-    """One sentence: who leads, by how much, how surely, and whether the fair views agree."""
-    if not views:
-        (label,) = groups
-        return f"There is one group only ({label}), so there is nothing to compare; by=KEY splits it."
-    main, *fair = views
-    sizes = " and ".join(str(len(groups[main[side]])) for side in ("leader", "other"))
-    known = f"95 % interval {main['low']:,.0f} to {main['high']:,.0f}, " if not np.isnan(main["low"]) else ""
-    gap = f"{main['difference']:,.0f} points of evaluation IQM ({known}{sizes} runs)"
-    if main["decided"]:
-        said = f"{main['leader']} plays better than {main['other']}, by {gap}"
-    elif main["more_seeds"] is None:
-        said = f"Not decided: {main['leader']} is ahead of {main['other']} by {gap}, too little for any number of seeds"
-    else:
-        more = (
-            f"one seed says nothing of the next, so at least {main['more_seeds']} more seeds each are needed"
-            if np.isnan(main["low"])
-            else f"about {main['more_seeds']} more seeds each would decide a difference of this size"
-        )
-        said = f"Not decided: {main['leader']} is ahead of {main['other']} by {gap}; {more}"
-    sides = defaultdict(list)
-    for view in fair:
-        sides[view["leader"]].append(f"{view['view']}{'' if view['decided'] else ' (not decided)'}")
-    if sides:
-        said += "; in training " + " and ".join(f"{label} leads at {', '.join(at)}" for label, at in sides.items())
-    return said + "."
+def _at_once(values: Mapping[str, Mapping[int, float]]) -> dict[tuple[str, str], tuple[float, float]]:
+    """Intervals of all differences, as of one look with an error of 5 %; none of fewer than `FEWEST_SEEDS` seeds.
+
+    Of groups with unequal numbers of seeds there are none either, since they would not be of the difference shown.
+    """
+    sizes = {len(seeds) for seeds in values.values()}
+    if len(sizes) > 1 or min(sizes) < FEWEST_SEEDS:
+        return {}
+    verdicts = decide(values, Plan(looks=(min(sizes),))).verdicts
+    intervals = {(verdict.group, verdict.other): (verdict.low, verdict.high) for verdict in verdicts}
+    return intervals | {(other, group): (-high, -low) for (group, other), (low, high) in intervals.items()}
 
 
-def _notes(
-    groups: Groups, by: Sequence[str], views: Table, evaluation: Table, random_player: Row, frames: float
-) -> list[str]:
-    """What a reader must know before believing the tables."""
-    notes = []
-    for label, runs in groups.items():
-        if len(runs) < FEWEST_SEEDS:
-            notes.append(
-                f"{label} has {len(runs)} of the {FEWEST_SEEDS} seeds without which no interval can be trusted."
-            )
-    varied = {label: _differing([run.science for run in runs]) for label, runs in groups.items()}
-    for label, keys in varied.items():
-        if keys := {key: values for key, values in keys.items() if key != "seed"}:
-            listed = ", ".join(f"{key} ({' or '.join(values)})" for key, values in keys.items())
-            notes.append(f"{label} mixes runs that differ in more than their seed: {listed}; by= can tell them apart.")
-    within = {key for keys in varied.values() for key in keys}
-    firsts = [runs[0] for runs in groups.values()]
-    asked = {resolve(key, run.config) for key in by for run in firsts}
-    between = {
-        key: values
-        for key, values in _differing([run.science for run in firsts]).items()
-        if key not in within | asked and not set(by) & set(key.split("."))
-    }
-    if between:
-        listed = ", ".join(f"{key} ({' or '.join(values)})" for key, values in between.items())
-        notes.append(f"The groups also differ in {listed}.")
-    shown = {view["view"] for view in views}
-    missing = [name for name in AXES.values() if views and name not in shown]
-    if missing:
-        notes.append(f"No verdict at {' and '.join(missing)}: a run has no such learning curve, or one too short.")
-    if capped := [f"{row['time_cap_share']:.0%} of {row['group']}" for row in evaluation if row["time_cap_share"] > 0]:
-        notes.append(
-            f"The time cap ended episodes and so decides their scores: {', '.join(capped)}; "
-            f"look at the score per 1,000 steps."
-        )
-    for runs in groups.values():
-        notes += [
-            f"{run.name} scored {_HELD:,.0f} in every episode, as any one action does that is held: it has collapsed."
-            for run in runs
-            if (run.episodes.scores == _HELD).all()
-        ]
-    if random_player["protocol"].startswith("published"):
-        notes.append(
-            "No random player was measured under these settings, so a published one takes its place; "
-            "python -m atlantis_exp baseline with the same env measures one."
-        )
-    if frames <= EARLY_FRAMES and any(row["iqm"] < random_player["score"] for row in evaluation):
-        notes.append(early_dqn())
-    return notes
-
-
-def early_dqn() -> str:
-    """Why below random is no bug, from the published learning curves."""
-    at = [row for row in literature("curves") if row["name"].startswith("DQN") and row["frames"] == 5e6]
-    low, high = min(row["mean"] for row in at), max(row["mean"] for row in at)
-    return (
-        f"At 5 M frames published DQN scores {low:,.0f} to {high:,.0f}, below the random player's "
-        f"{RANDOM_SCORE:,.0f}: below random is normal here ({at[0]['source'].rpartition('/')[0]})."
-    )
-
-
-def _differing(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
-    """The keys in which configs differ, with their values."""
-    keys = dict.fromkeys(key for config in configs for key in config)
-    values = {key: list(dict.fromkeys(json.dumps(config.get(key)) for config in configs)) for key in keys}
-    return {key: found for key, found in values.items() if len(found) > 1}
+def _in_training(views: Table) -> str:
+    """Who leads in the fair views."""
+    sides: dict[str, list[str]] = defaultdict(list)
+    for view in views:
+        if view["difference"] and view["view"] not in sides[view["leader"]]:
+            sides[view["leader"]].append(view["view"])
+    if not any(sides.values()):
+        return ""
+    leads = " and ".join(f"{label} leads at {', '.join(at)}" for label, at in sides.items() if at)
+    return f"In training {leads}: a description, which nothing is decided by."

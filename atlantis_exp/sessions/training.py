@@ -19,7 +19,7 @@ from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.job import Job, labels
 from atlantis_exp.sessions.stopping import StopRequest, sweep_goes_on
 from atlantis_exp.tracking.publishing import catch_up, publishing
-from atlantis_exp.training.forecast import forecast
+from atlantis_exp.training.forecast import Forecast, forecast
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Outcome, Trainer
 
@@ -114,8 +114,9 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
     journal.status("RUNNING")
 
 
-def _check_forecast(trainer: Trainer, config: Config, steps_done: int, progress: Progress) -> None:
-    expected = forecast(
+def expected(trainer: Trainer, config: Config, steps_done: int) -> Forecast:
+    """What the rest of a training will cost here; its parts are as before afterwards."""
+    return forecast(
         trainer,
         capacity=config.replay.capacity,
         max_bytes=config.replay.max_bytes,
@@ -124,11 +125,15 @@ def _check_forecast(trainer: Trainer, config: Config, steps_done: int, progress:
         steps_done=steps_done,
         evaluations_an_episode=1 / (config.evaluation.every_episodes or float("inf")),
     )
-    progress.say(str(expected))
-    if expected.shortage is not None:
+
+
+def _check_forecast(trainer: Trainer, config: Config, steps_done: int, progress: Progress) -> None:
+    cost = expected(trainer, config, steps_done)
+    progress.say(str(cost))
+    if cost.shortage is not None:
         if config.budget.forecast == "refuse":
-            raise Fault(f"{expected.shortage}; budget.forecast=warn starts all the same")
-        progress.say(f"warning: {expected.shortage}")
+            raise Fault(f"{cost.shortage}; budget.forecast=warn starts all the same")
+        progress.say(f"warning: {cost.shortage}")
 
 
 @contextmanager

@@ -105,6 +105,7 @@ def test_the_flops_of_an_update_are_those_of_its_layers() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1_200)  # two trainings of 16 environments, and MLflow
 def test_overhead_tells_the_share_of_tracking(capsys: pytest.CaptureFixture[str]) -> None:
     results = results_of(overhead.main, "--rounds 1 --seconds 1 --commit-seconds 0.5", capsys)
     assert 0 < results["tracking_share"] < 1

@@ -8,40 +8,35 @@ from pathlib import Path
 import mlflow
 import pytest
 
+from atlantis_exp.commands.compare import VERB
 from atlantis_exp.config import Config
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.training import train
 
-Command = Callable[..., int]
 Recorded = Callable[..., Path]
 
 
 def test_a_comparison_is_a_page_figures_and_tables_in_a_folder_and_in_the_store(
-    command: Command,
-    recorded: Recorded,
-    mlflow_tables: Callable[[Path], None],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    mlflow_tables(tmp_path)  # which says so where they are the first
-    capsys.readouterr()
-    for seed in range(3):
+    for seed in range(5):
         recorded("model=cnn", f"seed={seed}", scores=(1_000.0 + seed, 1_200.0))
         recorded("model=resnet", f"seed={seed}", scores=(9_000.0 + seed, 9_200.0))
     (tmp_path / "runs" / "foreign").mkdir()
-    words = (f"paths.outputs={tmp_path}", "by=model,seed", "where=model=cnn")
-    assert command("compare", *words, "resamples=100") == 0
-    assert command("compare", f"paths.outputs={tmp_path}", "resamples=100") == 0
+    command = (f"paths.outputs={tmp_path}", "by=model,seed", "where=model=cnn")
+    VERB.run([*command])
+    VERB.run([f"paths.outputs={tmp_path}"])
     shown = capsys.readouterr()
-    assert shown.err == "atlantis_exp: left out foreign: foreign: it has no config.json\n" * 2
-    assert "resnet plays better than cnn, by 8,000 points of evaluation IQM" in " ".join(shown.out.split())
+    said = [line for line in shown.err.splitlines() if " INFO mlflow" not in line]  # of tables that are made
+    assert said == ["atlantis_exp: left out foreign: foreign: it has no config.json"] * 2
+    assert "resnet plays better than cnn by 8,000 points (7," in " ".join(shown.out.split())
     path = Path(shown.out.rstrip().splitlines()[-1])
     assert path.name == "comparison.html"
     assert path.is_relative_to(tmp_path / "comparisons")
     assert "resnet plays better than cnn" in path.read_text()
     assert len(list((path.parent / "figures").glob("*.png"))) == 9
     with open(path.parent / "tables" / "runs.csv") as file:
-        assert len(list(csv.DictReader(file))) == 6
+        assert len(list(csv.DictReader(file))) == 10
 
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path}/mlflow.db")
     experiment = client.get_experiment_by_name("atlantis")
@@ -51,16 +46,16 @@ def test_a_comparison_is_a_page_figures_and_tables_in_a_folder_and_in_the_store(
     assert stored.info.run_name == path.parents[1].name
     assert stored.data.tags["atlantis.kind"] == "comparison"
     assert "resnet plays better" in stored.data.tags["mlflow.note.content"]
-    assert stored.data.metrics["evaluation/difference"] == 8_000
+    assert stored.data.metrics["difference/cnn over resnet"] == -8_000
     assert {item.path for item in client.list_artifacts(stored.info.run_id)} == {"comparison.html", "figures", "tables"}
     assert "cnn-seed-0-vs-cnn-seed-1" in str(small.info.run_name)
 
 
 @pytest.mark.slow
-def test_the_same_comparison_again_is_the_same_run(command: Command, recorded: Recorded, tmp_path: Path) -> None:
+def test_the_same_comparison_again_is_the_same_run(recorded: Recorded, tmp_path: Path) -> None:
     recorded()
     for _ in range(2):
-        assert command("compare", f"paths.outputs={tmp_path}", "tracking=none", "resamples=100") == 0
+        VERB.run([f"paths.outputs={tmp_path}", "tracking=none"])
     assert len(list((tmp_path / "comparisons").iterdir())) == 1
 
 
@@ -72,11 +67,10 @@ def test_the_same_comparison_again_is_the_same_run(command: Command, recorded: R
         ((), ("by=modle",), "by=modle: no such key"),
         ((), ("where=seed=5",), "there is no finished training"),
         ((), ("at_epsilon=2",), "at_epsilon=2: should be less"),
-        ((), ("resample=2",), "resample=2: no such key; did you mean 'resamples'"),
+        ((), ("seed=2",), "seed=2: no such key; did you mean 'seeds'"),
     ],
 )
 def test_a_refusal_is_one_line_and_code_2_and_leaves_nothing_behind(
-    command: Command,
     recorded: Recorded,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -86,7 +80,8 @@ def test_a_refusal_is_one_line_and_code_2_and_leaves_nothing_behind(
 ) -> None:
     recorded()
     recorded("seed=1", *overrides)
-    assert command("compare", f"paths.outputs={tmp_path}", *words, "resamples=100") == 2
+    with pytest.raises(SystemExit, match="2"):
+        VERB.run([f"paths.outputs={tmp_path}", *words])
     error = capsys.readouterr().err
     assert error.startswith(f"atlantis_exp: {line}")
     assert error.count("\n") == 1
@@ -95,11 +90,11 @@ def test_a_refusal_is_one_line_and_code_2_and_leaves_nothing_behind(
 
 @pytest.mark.slow
 def test_a_real_training_can_be_compared(
-    command: Command, tiny: Callable[..., Config], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny: Callable[..., Config], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for seed in (0, 1):
         train(Job(tiny(f"seed={seed}")))
-    assert command("compare", f"paths.outputs={tmp_path}", "tracking=none", "by=seed", "resamples=100") == 0
+    VERB.run([f"paths.outputs={tmp_path}", "tracking=none", "by=seed"])
     shown = capsys.readouterr()
     assert shown.err == ""
     page = Path(shown.out.rstrip().splitlines()[-1])
@@ -108,7 +103,7 @@ def test_a_real_training_can_be_compared(
     for row in runs:
         result = json.loads((tmp_path / "runs" / row["run"] / "result.json").read_bytes())
         assert float(row["mean"]) == result["evaluation"]["evaluation/mean"]
-        assert float(row["iqm"]) == result["evaluation"]["evaluation/interquartile_mean"]
+        assert float(row["score"]) == result["evaluation"]["evaluation/interquartile_mean"]
         assert float(row["frames"]) == result["counts"]["frames"]
         assert float(row["flops"]) > 0
     with open(page.parent / "tables" / "actions.csv") as file:

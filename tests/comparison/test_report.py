@@ -16,6 +16,7 @@ from atlantis_exp.comparison.figures import Drawn, draw
 from atlantis_exp.comparison.gather import gather, group
 from atlantis_exp.comparison.report import number, page
 from atlantis_exp.comparison.tables import Comparison, compare
+from atlantis_exp.comparison.verdict import Question
 
 Recorded = Callable[..., Path]
 
@@ -27,7 +28,7 @@ def comparison(recorded: Recorded, tmp_path: Path) -> Comparison:
         recorded("model=resnet", f"seed={seed}", scores=(8_000.0 + seed, 9_876.0, 9_100.0, 8_700.0))
     (tmp_path / "runs" / "<script>alert(1)<").mkdir()
     gathered = gather(tmp_path)
-    return compare(gathered, group(gathered.trainings, ["model"]), ["model"], 200, 0)
+    return compare(gathered, group(gathered.trainings, ["model"]), Question(["model"]))
 
 
 @pytest.fixture(scope="module")
@@ -94,8 +95,8 @@ def test_the_page_says_the_verdict_the_notes_and_every_shown_table(
     text = page(comparison, figures, {})
     assert comparison.verdict in text
     assert all(note.replace("'", "&#39;").replace('"', "&#34;") in text for note in comparison.notes)
-    for row in comparison.tables["evaluation"]:
-        assert f"{row['iqm']:,.0f} ({row['iqm_low']:,.0f} to {row['iqm_high']:,.0f})" in text
+    for row in comparison.tables["scores"]:
+        assert f'<td class="number">{row["score"]:,.0f}</td>' in text
     for row in comparison.tables["runs"]:
         assert row["run"] in text
     for row in comparison.tables["references"]:
@@ -105,15 +106,16 @@ def test_the_page_says_the_verdict_the_notes_and_every_shown_table(
 @pytest.mark.parametrize(
     ("value", "column", "text"),
     [
-        (12_345.6, "iqm", "12,346"),
+        (12_345.6, "score", "12,346"),
         (0.0, "low", "0"),
         (0.25, "probability", "25.0%"),
         (0.05, "epsilon", "0.05"),
         (3, "seed", "3"),
         (1.5e12, "flops", "1.5e+12"),
         (0.00123, "hours", "0.00123"),
-        (True, "decided", "yes"),
-        (None, "more_seeds", "over 1,000"),
+        (True, "truncated", "yes"),
+        (float("nan"), "difference", ""),
+        (0.0125, "spent", "1.25%"),
         ("cnn", "group", "cnn"),
     ],
 )
@@ -124,7 +126,7 @@ def test_numbers_are_written_for_people(value: object, column: str, text: str) -
 def test_figures_are_pictures_of_something_and_take_on_the_pages_ink(figures: dict[str, Drawn]) -> None:
     assert list(figures) == [
         *("learning_frames", "exploration", "learning_hours", "learning_flops"),
-        *("evaluation", "distribution", "profile", "actions", "references"),
+        *("scores", "distribution", "profile", "actions", "references"),
     ]
     for figure in figures.values():
         pixels = np.asarray(Image.open(io.BytesIO(figure.png)).convert("RGB"))
@@ -133,7 +135,7 @@ def test_figures_are_pictures_of_something_and_take_on_the_pages_ink(figures: di
         assert "currentColor" in figure.svg
         assert "#24292f" not in figure.svg
         assert "cnn" in figure.svg
-    assert "cnn 1,673" in figures["evaluation"].alt
+    assert "cnn 1,673" in figures["scores"].alt
 
 
 @pytest.mark.slow
@@ -147,8 +149,8 @@ def test_the_same_comparison_draws_the_same_figures(comparison: Comparison) -> N
 def test_a_comparison_without_curves_has_the_other_figures(recorded: Recorded, tmp_path: Path) -> None:
     recorded(curve=())
     gathered = gather(tmp_path)
-    figures = draw(compare(gathered, group(gathered.trainings, ["model"]), ["model"], 200, 0))
-    assert list(figures) == ["evaluation", "distribution", "profile", "actions", "references"]
+    figures = draw(compare(gathered, group(gathered.trainings, ["model"]), Question(["model"])))
+    assert list(figures) == ["scores", "distribution", "profile", "actions", "references"]
 
 
 def test_comparing_loads_no_torch() -> None:

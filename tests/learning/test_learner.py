@@ -526,6 +526,48 @@ def test_a_restored_learner_continues_bit_for_bit(
     assert restored.learning_rate == 3e-4
 
 
+@every_network
+@pytest.mark.parametrize("updates", [0, 11])
+def test_a_block_may_update_a_learner_that_is_then_the_one_before(network_class: type[nn.Module], updates: int) -> None:
+    side, shards = _SIDE[network_class], 2 if network_class is DQNCnn else 1
+    learner, untouched = (_learner(network_class, precision="bf16", shards=shards, ema=15) for _ in range(2))
+    for seed in range(updates):
+        learner.update(*_batch(side, seed))
+        untouched.update(*_batch(side, seed))
+    with learner.restored():
+        learner.learning_rate = 1.0
+        learner.update(*_batch(side, 20))
+        assert learner.updates == updates + 1
+    torch.testing.assert_close(learner.state_dict(), untouched.state_dict(), rtol=0, atol=0)
+    for each in (learner, untouched):
+        each.update(*_batch(side, 21))
+    torch.testing.assert_close(learner.state_dict(), untouched.state_dict(), rtol=0, atol=0)
+    assert learner.statistics() == untouched.statistics()
+
+
+@every_network
+def test_to_count_the_operations_of_an_update_changes_nothing_and_threads_and_compilation_count_the_same(
+    network_class: type[nn.Module],
+) -> None:
+    side, shards = _SIDE[network_class], 2 if network_class is DQNCnn else 1
+    counted, untouched = (_learner(network_class, target_mode="train") for _ in range(2))
+    for each in (counted, untouched):
+        each.update(*_batch(side))
+    flops = counted.update_flops((4, side, side), 6)
+    assert flops > 0
+    assert counted.update_flops((4, side, side), 12) == 2 * flops
+    for each in (counted, untouched):
+        each.update(*_batch(side, 1))
+    torch.testing.assert_close(counted.state_dict(), untouched.state_dict(), rtol=0, atol=0)
+    assert counted.statistics() == untouched.statistics()
+    assert _learner(network_class, shards=shards).update_flops((4, side, side), 6) == flops
+
+    def compile(_: nn.Module) -> nn.Module:
+        return nn.Identity()  # which would count nothing, and fail
+
+    assert _learner(network_class, compile=compile).update_flops((4, side, side), 6) == flops
+
+
 def test_a_loaded_state_stays_the_caller_s() -> None:
     learner, restored = _learner(DQNCnn), _learner(DQNCnn, seed=10)
     learner.update(*_batch(36))

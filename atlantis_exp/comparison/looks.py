@@ -1,0 +1,78 @@
+"""The record of a comparison's looks, `looks.json` in its folder: what the next look must know of those before."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from atlantis_exp.comparison.verdict import Answer, Family
+from atlantis_exp.decision import FEWEST_SEEDS, Look
+from atlantis_exp.faults import Fault
+from atlantis_exp.runs.journal import write_file
+
+LOOKS = "looks.json"
+
+_MOST_BYTES = 16 * 2**20
+_RECORD = TypeAdapter(dict[str, list[Look]])
+
+Record = dict[str, list[Look]]
+"""The looks of each family, in order."""
+
+
+def read_looks(folder: Path, families: Sequence[Family]) -> Record:
+    """The looks taken at some families; empty before the first.
+
+    Raises:
+        Fault: on a file that no comparison of these families left so.
+    """
+    path = folder / LOOKS
+    if not path.exists():
+        return {}
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise ValueError(f"it has more than {_MOST_BYTES:,} bytes")
+        record = _RECORD.validate_json(path.read_bytes(), strict=True)
+        if unknown := record.keys() - {family.name for family in families}:
+            raise ValueError(f"it has looks at {min(unknown)!r}")
+        for family in families:
+            _check(family, record.get(family.name, []))
+    except (ValueError, OSError) as error:
+        reason = "its form is wrong" if isinstance(error, ValidationError) else error
+        raise Fault(
+            f"{path} is no record of this comparison's looks ({reason}): restore it, for without it the error that "
+            f"they spent would be spent again"
+        ) from None
+    return record
+
+
+def write_looks(folder: Path, answers: Sequence[Answer]) -> None:
+    """Keep the looks of all families, before anybody sees what they found."""
+    record = {answer.family.name: [asdict(look) for look in answer.decision.looks] for answer in answers}
+    write_file(folder / LOOKS, json.dumps(record, indent=1).encode())
+
+
+def _check(family: Family, looks: Sequence[Look]) -> None:
+    """Raise ValueError for looks that the family's plan cannot have led to."""
+    open_pairs = set(family.plan.pairs(family.seeds))
+    size, spent = FEWEST_SEEDS - 1, 0.0
+    for look in looks:
+        pairs = {(verdict.group, verdict.other) for verdict in look.verdicts}
+        sizes = {len(set(seeds)) for seeds in look.seeds.values()} | {look.size if look.seeds else 0}
+        numbers = [value for verdict in look.verdicts for value in (verdict.difference, verdict.low, verdict.high)]
+        spent += look.error
+        if (
+            pairs != open_pairs
+            or len(pairs) != len(look.verdicts)
+            or {name for pair in pairs for name in pair} != set(look.seeds)
+        ):
+            raise ValueError(f"its looks by {family.name} are at other pairs")
+        sizes |= {verdict.seeds for verdict in look.verdicts}
+        if len(sizes) != 1 or not size < look.size <= family.plan.looks[-1] or not np.isfinite(numbers).all():
+            raise ValueError(f"its looks by {family.name} are at impossible numbers")
+        if not look.error > 0 or spent > family.plan.error * (1 + 1e-9):
+            raise ValueError(f"its looks by {family.name} spent what there is not")
+        size = look.size
+        open_pairs = {(verdict.group, verdict.other) for verdict in look.verdicts if verdict.said == "not decided"}

@@ -1,0 +1,227 @@
+"""What a reader must know before believing a comparison: one small function a matter, each with its lines or none."""
+
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from atlantis_exp.comparison.gather import AXES, COMMIT, Training, resolve
+from atlantis_exp.comparison.published import Table, early_dqn, random_line
+from atlantis_exp.comparison.verdict import Answer, counted
+from atlantis_exp.decision import FEWEST_SEEDS, equal_scores
+from atlantis_exp.statistics import EARLY_FRAMES
+
+_NAMED = 6  # runs, up to which a line names them
+
+
+@dataclass(frozen=True)
+class Facts:
+    """All that a note may be about."""
+
+    groups: Mapping[str, Sequence[Training]]
+    by: Sequence[str]
+    answers: Sequence[Answer]
+    tables: Mapping[str, Table]
+    frames: float  # of the longest training
+
+    @property
+    def trainings(self) -> list[Training]:
+        """All runs that are compared."""
+        return [training for runs in self.groups.values() for training in runs]
+
+
+def collapsed(facts: Facts) -> Iterator[str]:
+    """Policies of one action."""
+    for label, runs in facts.groups.items():
+        if names := [run.name for run in runs if run.has_collapsed]:
+            yield (
+                f"{len(names)} of {len(runs)} runs of {label} collapsed to one action, so their scores say little of "
+                f"learning: {_listed(names)}."
+            )
+
+
+def equal_within(facts: Facts) -> Iterator[str]:
+    """Runs that do not count as seeds."""
+    for runs in facts.groups.values():
+        for name, first in counted(runs)[1].items():
+            yield f"{name} has the same score in every episode as {first.name}: the two count as one seed."
+
+
+def equal_across(facts: Facts) -> Iterator[str]:
+    """Equal lists of scores in different groups, which count."""
+    group_of = {run.name: label for label, runs in facts.groups.items() for run in counted(runs)[0]}
+    scores = {run.name: run.episodes.scores.tolist() for run in facts.trainings if run.name in group_of}
+    alike = defaultdict(list)
+    for names in equal_scores(scores):
+        if len(labels := dict.fromkeys(group_of[name] for name in names)) > 1:
+            alike[" and ".join(labels)].extend(names)
+    for labels_of, names in alike.items():
+        yield f"{labels_of} have runs with the same score in every episode: {_listed(names)}."
+
+
+def modes_found(facts: Facts) -> Iterator[str]:
+    """Seeds that fall into two modes."""
+    for row in facts.tables["modes"]:
+        yield (
+            f"{row['group']} falls into two modes: {row['upper_share']:.0%} of its seeds score "
+            f"{row['upper_score']:,.0f} on average, the others {row['lower_score']:,.0f}; {row['time_cap_share']:.0%} "
+            f"of its episodes reach the time cap, at {row['points_per_frame']:.3g} points per frame."
+        )
+
+
+def different_makers(facts: Facts) -> Iterator[str]:
+    """Precisions and devices, which do not enter a run's identity."""
+    for tag, called in (("precision", "precisions"), ("device", "devices")):
+        holders = defaultdict(list)
+        for run in facts.trainings:
+            if tag in run.tags:
+                holders[run.tags[tag]].append(run.name)
+        if len(holders) > 1:
+            named = "; ".join(f"{value}: {_listed(names)}" for value, names in sorted(holders.items()))
+            yield f"The runs were made in different {called}: {named}."
+
+
+def uncommitted(facts: Facts) -> Iterator[str]:
+    """Runs of code that no commit holds, where commits are compared."""
+    names = [run.name for run in facts.trainings if run.tags.get("git.dirty") == "true"]
+    if COMMIT in facts.by and names:
+        yield f"Made with changes that their commit does not hold: {_listed(names)}."
+
+
+def unbalanced(facts: Facts) -> Iterator[str]:
+    """Groups that a key's values cannot be averaged over, and keys that are not answered by themselves."""
+    for answer in facts.answers:
+        family = answer.family
+        if family.left_out:
+            left_out = _listed(family.left_out)
+            yield f"By {family.name}, some groups do not count, for not all values have their like: {left_out}."
+        for value, members in family.groups.items():
+            if members and (alone := set.union(*(set(group.seeds) for group in members)) - family.seeds[value].keys()):
+                yield (
+                    f"By {family.name}, {value} goes without seed {', '.join(map(str, sorted(alone)))}, which not all "
+                    f"of its groups have."
+                )
+    names = [answer.family.name for answer in facts.answers]
+    if facts.answers and "," in names[-1]:
+        for key in set(names[-1].split(",")) - set(names):
+            yield f"{key} is not answered by itself: its values share no value of the other keys."
+
+
+def later_seeds(facts: Facts) -> Iterator[str]:
+    """Seeds that came after the look that a verdict rests on."""
+    late: dict[str, int] = {}
+    for answer in facts.answers:
+        counts = {value: len(seeds) for value, seeds in answer.family.seeds.items()}
+        for verdict in answer.decision.verdicts:
+            late |= {
+                value: counts[value] for value in (verdict.group, verdict.other) if 0 < verdict.seeds < counts[value]
+            }
+    if late:
+        yield (
+            "Verdicts rest on the seeds of their looks, scores are of all seeds there are: "
+            f"{_listed([f'{value} has {seeds}' for value, seeds in late.items()])}."
+        )
+
+
+def unplanned(facts: Facts) -> Iterator[str]:
+    """Looks between the planned ones."""
+    for answer in facts.answers:
+        for look in answer.decision.looks:
+            if look.size not in answer.family.plan.looks:
+                yield (
+                    f"By {answer.family.name}, a look was taken at {look.size} seeds, where none was planned: it spent "
+                    f"{look.error:.2%} of the error."
+                )
+
+
+def few_seeds(facts: Facts) -> Iterator[str]:
+    """Groups that can decide nothing."""
+    for label, runs in facts.groups.items():
+        seeds = len({run.config["seed"] for run in counted(runs)[0]})
+        if seeds < FEWEST_SEEDS:
+            yield f"{label} has {seeds} of the {FEWEST_SEEDS} seeds without which nothing is decided."
+
+
+def mixed(facts: Facts) -> Iterator[str]:
+    """Differences within a group, and between groups beyond the question."""
+    varied = {label: _differing([run.science for run in runs]) for label, runs in facts.groups.items()}
+    for label, keys in varied.items():
+        if keys := {key: values for key, values in keys.items() if key != "seed"}:
+            yield f"{label} mixes runs that differ in more than their seed: {_values(keys)}; by= can tell them apart."
+    within = {key for keys in varied.values() for key in keys}
+    firsts = [runs[0] for runs in facts.groups.values()]
+    asked = {resolve(key, run.config) for key in facts.by for run in firsts}
+    between = {
+        key: values
+        for key, values in _differing([run.science for run in firsts]).items()
+        if key not in within | asked and not set(facts.by) & set(key.split("."))
+    }
+    if between:
+        yield f"The groups also differ in {_values(between)}."
+
+
+def missing_views(facts: Facts) -> Iterator[str]:
+    """Views of the training that cannot be had."""
+    shown = {row["view"] for row in facts.tables["views"]}
+    missing = [name for name in AXES.values() if len(facts.groups) > 1 and name not in shown]
+    if missing:
+        yield f"Nothing is said of {' and '.join(missing)}: a run has no such learning curve, or one too short."
+
+
+def capped(facts: Facts) -> Iterator[str]:
+    """Scores that the time cap decides."""
+    if shares := [
+        f"{row['time_cap_share']:.0%} of {row['group']}" for row in facts.tables["evaluation"] if row["time_cap_share"]
+    ]:
+        yield (
+            f"The time cap ended episodes and so decides their scores: {', '.join(shares)}; "
+            f"look at the points per frame."
+        )
+
+
+def other_players(facts: Facts) -> Iterator[str]:
+    """What the random player's line is worth."""
+    random_player = random_line(facts.tables["references"])
+    if random_player["protocol"].startswith("published"):
+        yield (
+            "No random player was measured under these settings, so a published one takes its place; "
+            "python -m atlantis_exp baseline with the same env measures one."
+        )
+    scores = [row["score"] for row in facts.tables["scores"]]
+    if facts.frames <= EARLY_FRAMES and any(score < random_player["score"] for score in scores):
+        yield early_dqn()
+
+
+BESIDE: Sequence[Callable[[Facts], Iterator[str]]] = (
+    *(
+        collapsed,
+        equal_within,
+        equal_across,
+        modes_found,
+        different_makers,
+        uncommitted,
+        unbalanced,
+        later_seeds,
+        unplanned,
+    ),
+)
+"""What is said beside the verdict, since it can make it mean something else."""
+
+NOTES: Sequence[Callable[[Facts], Iterator[str]]] = (few_seeds, mixed, missing_views, capped, other_players)
+"""What is said after it."""
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - _NAMED
+    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _values(keys: Mapping[str, Sequence[str]]) -> str:
+    return ", ".join(f"{key} ({' or '.join(values)})" for key, values in keys.items())
+
+
+def _differing(configs: Sequence[Mapping[str, object]]) -> dict[str, list[str]]:
+    """The keys in which configs differ, with their values."""
+    keys = dict.fromkeys(key for config in configs for key in config)
+    values = {key: list(dict.fromkeys(json.dumps(config.get(key)) for config in configs)) for key in keys}
+    return {key: found for key, found in values.items() if len(found) > 1}

@@ -1,0 +1,213 @@
+"""What is asked of groups of runs, and the answers: a decision for each family of pairs.
+
+A seed's *score* is the interquartile mean of its evaluated episodes; a group's score is the mean over its seeds. No
+other quantity is decided about. `families` turns groups and a question into what is compared with what, `answer` takes
+the looks that are due, and `wanted` says which seeds the next looks need.
+"""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import count, islice
+
+import numpy as np
+
+from atlantis_exp.checking import nearest
+from atlantis_exp.comparison.gather import COMMIT, Training, values_of
+from atlantis_exp.decision import Decision, Look, Plan, decide, equal_scores, looks_up_to
+from atlantis_exp.faults import ConfigError
+from atlantis_exp.statistics import interquartile_mean
+
+_SHORTEST_COMMIT = 4  # digits of a commit's name, as git itself wants them
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked of groups, and the error that the whole answer may have."""
+
+    by: Sequence[str]  # keys, the first of which is what is asked first
+    seeds: int = 10  # a group, at the plan's last look
+    error: float = 0.05  # probability of any false verdict, over all families, pairs and looks
+    delta: float | None = None  # a difference that does not matter
+    relative: bool = False  # whether delta is a share of a score
+    baseline: str | None = None  # a value of one of the keys, or a group
+
+
+@dataclass(frozen=True)
+class Group:
+    """The runs of one value for each key of `by`, one score a seed."""
+
+    values: tuple[str, ...]
+    seeds: dict[int, float]
+    same: dict[int, int] = field(default_factory=dict)  # seeds that do not count: to the one whose episodes they equal
+
+    @property
+    def label(self) -> str:
+        """What people call it."""
+        return " ".join(self.values) or "all"
+
+
+@dataclass(frozen=True)
+class Family:
+    """What is compared with what: the values of one key, averaged over the groups of all others, or all groups."""
+
+    name: str  # the key, or all keys that differ
+    plan: Plan
+    seeds: dict[str, dict[int, float]]  # of each value: one score a seed
+    groups: dict[str, list[Group]]  # of each value: what it is averaged over
+    left_out: list[str]  # labels of groups that not all values have the like of
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Where a family stands."""
+
+    family: Family
+    decision: Decision
+    taken: Look | None  # just now
+
+
+def scored(training: Training) -> float:
+    """The score of a seed: the interquartile mean of its evaluated episodes."""
+    return interquartile_mean(training.episodes.scores)
+
+
+def counted(runs: Sequence[Training]) -> tuple[list[Training], dict[str, Training]]:
+    """The runs that count as seeds of one group, and those that do not: their names to the run they are the same as.
+
+    Runs of equal lists of episode scores are one, that of the lowest seed.
+    """
+    runs = sorted(runs, key=lambda run: (run.config["seed"], run.name))
+    by_name = {run.name: run for run in runs}
+    same = {
+        name: by_name[first]
+        for first, *others in equal_scores({run.name: run.episodes.scores.tolist() for run in runs})
+        for name in others
+    }
+    return [run for run in runs if run.name not in same], same
+
+
+def group_of(runs: Sequence[Training], by: Sequence[str]) -> Group:
+    """One score a seed of the runs of a group; runs of the same seed, which only a mixed group has, are averaged."""
+    kept, same = counted(runs)
+    scores = defaultdict(list)
+    for run in kept:
+        scores[int(run.config["seed"])].append(scored(run))
+    dropped = {
+        int(run.config["seed"]): int(same[run.name].config["seed"])
+        for run in runs
+        if run.name in same and run.config["seed"] not in scores
+    }
+    return Group(
+        values_of(runs[0], by), {seed: float(np.mean(found)) for seed, found in sorted(scores.items())}, dropped
+    )
+
+
+def families(groups: Sequence[Group], question: Question) -> list[Family]:
+    """What a question compares, the first key's values first; none where there is one group only.
+
+    Each key with several values is a family, whose values are averaged over the groups of the other keys at the same
+    seed: over those groups that all values have the like of, and the seeds that all of these have. Where several keys
+    have several values, all groups are a family too. The question's error is divided equally among the families.
+
+    Raises:
+        ConfigError: for a baseline that is none of what is compared.
+    """
+    keys = [index for index in range(len(question.by)) if len({group.values[index] for group in groups}) > 1]
+    if not keys:
+        if question.baseline is not None:
+            raise ConfigError(f"baseline={question.baseline}: there is one group only, so nothing to compare it with")
+        return []
+    averaged = [(question.by[index], _averaged(groups, index)) for index in keys if len(keys) > 1]
+    alone = {group.label: [group] for group in groups}
+    members = [(name, values) for name, values in averaged if values]
+    members.append((",".join(question.by[index] for index in keys), alone))
+    base = _baseline(members, groups, keys, question)
+    return [_family(name, values, groups, question, len(members), base.get(name)) for name, values in members]
+
+
+def _averaged(groups: Sequence[Group], index: int) -> dict[str, list[Group]]:
+    """The groups that each value of a key is averaged over; empty where not all values have the like of any."""
+    by_value: dict[str, dict[tuple[str, ...], Group]] = defaultdict(dict)
+    for group in groups:
+        by_value[group.values[index]][group.values[:index] + group.values[index + 1 :]] = group
+    shared = sorted(set.intersection(*(set(others) for others in by_value.values())))
+    return {value: [by_value[value][other] for other in shared] for value in sorted(by_value)} if shared else {}
+
+
+def _baseline(
+    members: Sequence[tuple[str, Mapping[str, list[Group]]]],
+    groups: Sequence[Group],
+    keys: Sequence[int],
+    question: Question,
+) -> dict[str, str]:
+    """The family that has the baseline, and what it is called there."""
+    asked = question.baseline
+    if asked is None:
+        return {}
+    if len(keys) == 1:  # its groups go by their full labels
+        (name, _), (index,) = members[0], keys
+        named = {group.values[index]: group.label for group in groups} | {group.label: group.label for group in groups}
+        choices = [(name, value, label) for value, label in named.items()]
+    else:
+        choices = [(name, value, value) for name, values in members for value in values]
+    exact = [(name, label) for name, value, label in choices if value == asked]
+    started = {
+        (name, label): value
+        for name, value, label in choices
+        if name == COMMIT and len(asked) >= _SHORTEST_COMMIT and (value.startswith(asked) or asked.startswith(value))
+    }
+    if exact or len(started) == 1:
+        return dict((exact or list(started))[:1])
+    if started:
+        raise ConfigError(f"baseline={asked}: could be any of {', '.join(started.values())}")
+    raise ConfigError(f"baseline={asked}: no such group; {nearest(asked, {value for _, value, _ in choices})}")
+
+
+def _family(
+    name: str,
+    values: dict[str, list[Group]],
+    groups: Sequence[Group],
+    question: Question,
+    among: int,
+    baseline: str | None,
+) -> Family:
+    plan = Plan(looks_up_to(question.seeds), question.error / among, question.delta, question.relative, baseline)
+    seeds = {}
+    for value, members in values.items():
+        common = sorted(set.intersection(*(set(group.seeds) for group in members)))
+        seeds[value] = {seed: float(np.mean([group.seeds[seed] for group in members])) for seed in common}
+    used = {group.label for members in values.values() for group in members}
+    return Family(name, plan, seeds, values, [group.label for group in groups if group.label not in used])
+
+
+def answer(asked: Sequence[Family], record: Mapping[str, Sequence[Look]], now: bool = False) -> list[Answer]:
+    """Take the looks that are due in each family, or with `now` one at the seeds there are.
+
+    Args:
+        record: the looks taken before, by family.
+    """
+    answers = []
+    for family in asked:
+        before = record.get(family.name, ())
+        decision = decide(family.seeds, family.plan, before, now=now)
+        taken = decision.looks[-1] if len(decision.looks) > len(before) else None
+        answers.append(Answer(family, decision, taken))
+    return answers
+
+
+def wanted(answers: Sequence[Answer]) -> dict[str, list[int]]:
+    """The seeds that each group lacks for the next look of every family that is not decided; empty where all are.
+
+    They are the lowest that are not there, so that contenders share their seeds.
+    """
+    lacking: dict[str, set[int]] = defaultdict(set)
+    for family, decision in ((each.family, each.decision) for each in answers):
+        for value in decision.contenders if decision.next_look is not None else ():
+            members = family.groups[value]
+            unusable = {seed for group in members for seed in group.same} | family.seeds[value].keys()
+            missing = max(0, (decision.next_look or 0) - len(family.seeds[value]))
+            for seed in islice((seed for seed in count() if seed not in unusable), missing):
+                for group in members:
+                    lacking[group.label] |= {seed} - group.seeds.keys()
+    return {label: sorted(seeds) for label, seeds in sorted(lacking.items()) if seeds}

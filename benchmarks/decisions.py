@@ -1,0 +1,283 @@
+"""How often a verdict is wrong for whoever follows it to the end: `python -m benchmarks.decisions`.
+
+Groups of ten seeds are drawn whose true means are known, and users compare them through `atlantis_exp.decision`: one
+who trains up to the next look that is printed, one who asks after every seed, and one who asks after every seed and has
+a look taken each time. All of them continue until nothing is open. A decision is false where it says better or worse
+of two groups of one mean, or equivalent of two that are delta apart. Values are in standard deviations of one group.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import norm
+
+from atlantis_exp.decision import Decision, Look, Plan, decide, mean_interval
+from benchmarks.contest import print_results, print_table
+
+Values = npt.NDArray[np.float64]
+Follow = Callable[[Values, Plan], tuple[Decision, int]]
+
+SEEDS = 10  # a group
+GROUPS = (2, 4, 8)
+NOISE = 0.1  # within a mode, in distances between the two
+RESAMPLES = 999
+
+
+def normal(rng: np.random.Generator, shape: tuple[int, ...]) -> Values:
+    """Mean 0, standard deviation 1, as all that follow."""
+    return rng.normal(size=shape)
+
+
+def lognormal(rng: np.random.Generator, shape: tuple[int, ...]) -> Values:
+    return np.asarray((rng.lognormal(size=shape) - np.exp(0.5)) / np.sqrt((np.e - 1) * np.e))
+
+
+def bimodal(rng: np.random.Generator, shape: tuple[int, ...], survival: float = 0.7) -> Values:
+    """Seeds that survive with this probability and else collapse, as in Atlantis."""
+    values = (rng.random(shape) < survival) + NOISE * rng.normal(size=shape)
+    return np.asarray((values - survival) / np.sqrt(survival * (1 - survival) + NOISE**2))
+
+
+def halves(rng: np.random.Generator, shape: tuple[int, ...]) -> Values:
+    return bimodal(rng, shape, 0.5)
+
+
+def steady(rng: np.random.Generator, shape: tuple[int, ...]) -> Values:
+    """Seeds that vary by a tenth of the others."""
+    return 0.1 * rng.normal(size=shape)
+
+
+SHAPES = {"normal": normal, "log-normal": lognormal, "bimodal 70:30": bimodal, "bimodal 50:50": halves}
+
+
+def advised(values: Values, plan: Plan) -> tuple[Decision, int]:
+    """Train contenders up to the look that is due next; the decision, and the number of seeds of group 0."""
+    return _follow(values, plan, lambda _, due: due, now=False)
+
+
+def one_by_one(values: Values, plan: Plan) -> tuple[Decision, int]:
+    """Ask after every seed."""
+    return _follow(values, plan, lambda trained, _: trained + 1, now=False)
+
+
+def every_seed(values: Values, plan: Plan) -> tuple[Decision, int]:
+    """Ask after every seed, and have a look taken whether it is due or not."""
+    return _follow(values, plan, lambda trained, _: trained + 1, now=True)
+
+
+def _follow(values: Values, plan: Plan, train: Callable[[int, int], int], now: bool) -> tuple[Decision, int]:
+    seeds = {f"group {index}": dict(enumerate(row)) for index, row in enumerate(values.tolist())}
+    trained = dict.fromkeys(seeds, 0)
+    contenders: Sequence[str] = list(seeds)
+    looks: Sequence[Look] = ()
+    due: int | None = plan.looks[0]
+    while due is not None:
+        trained |= {name: train(trained[name], due) for name in contenders}
+        groups = {name: {seed: row[seed] for seed in range(trained[name])} for name, row in seeds.items()}
+        decision = decide(groups, plan, looks, now=now)
+        contenders, looks, due = decision.contenders, decision.looks, decision.next_look
+    return decision, trained["group 0"]
+
+
+USERS: Mapping[str, Follow] = {"advised": advised, "one by one": one_by_one, "look every seed": every_seed}
+
+
+def false_decision(values: Values, plan: Plan, follow: Follow) -> bool:
+    """Whether anything is decided of groups of one mean."""
+    return any(verdict.said in ("better", "worse") for verdict in follow(values, plan)[0].verdicts)
+
+
+def false_of_two_means(values: Values, plan: Plan) -> bool:
+    """Whether a verdict is wrong where groups 1, 3 and 5 are delta better than groups 0, 2 and 4."""
+    for verdict in advised(values, plan)[0].verdicts:
+        above = int(verdict.group.split()[1]) % 2 - int(verdict.other.split()[1]) % 2
+        wrong = {0: ("better", "worse"), 1: ("worse", "equivalent"), -1: ("better", "equivalent")}
+        if verdict.said in wrong[above]:
+            return True
+    return False
+
+
+def found(values: Values, plan: Plan) -> tuple[float, float]:
+    """The share of the pairs with group 0 in which it is found better, and the seeds it takes until all of them are."""
+    decision, seeds = advised(values, plan)
+    pairs = [verdict.said == "better" for verdict in decision.verdicts if verdict.group == "group 0"]
+    return float(np.mean(pairs)), seeds
+
+
+def covered(values: Values, means: Values, plan: Plan) -> tuple[float, float]:
+    """The share of intervals that hold the true difference, and 1 where all of them do."""
+    holds = [
+        verdict.low <= means[int(verdict.group.split()[1])] - means[int(verdict.other.split()[1])] <= verdict.high
+        for verdict in advised(values, plan)[0].verdicts
+    ]
+    return float(np.mean(holds)), float(all(holds))
+
+
+def coverage_of_means(values: Values, rng: np.random.Generator) -> dict[str, float]:
+    """How often 95 % intervals of the mean over seeds hold 0, over rows of values, by method.
+
+    Student's t is what `decision.mean_interval` gives. The others are bootstraps over seeds (Efron and Tibshirani
+    1993): percentiles, bias-corrected and accelerated, and studentized.
+    """
+    rows, size = values.shape
+    means, errors = values.mean(axis=1), values.std(axis=1, ddof=1) / np.sqrt(size)
+    weights = rng.multinomial(size, np.full(size, 1 / size), RESAMPLES) / size
+    drawn = values @ weights.T
+    spreads = np.sqrt(np.maximum((values**2) @ weights.T - drawn**2, 0) / (size - 1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        studentized = np.where(spreads > 1e-9, (drawn - means[:, None]) / spreads, np.nan)
+    t_low, t_high = (np.nanquantile(studentized, share, axis=1) for share in (0.025, 0.975))
+    deviations = values - means[:, None]
+    below = (drawn < means[:, None]).mean(axis=1) + (drawn == means[:, None]).mean(axis=1) / 2
+    bias = norm.ppf(np.clip(below, 1 / RESAMPLES, 1 - 1 / RESAMPLES))
+    skew = (deviations**3).sum(axis=1) / (6 * (deviations**2).sum(axis=1) ** 1.5)
+    ends = [bias + (bias + z) / (1 - skew * (bias + z)) for z in (norm.ppf(0.025), norm.ppf(0.975))]
+    ranks = [np.clip((norm.cdf(end) * RESAMPLES).astype(int), 0, RESAMPLES - 1) for end in ends]
+    drawn.sort(axis=1)
+    at = np.arange(rows)
+    intervals = {
+        "t": np.array([mean_interval(row) for row in values]).T,
+        "percentile": np.quantile(drawn, (0.025, 0.975), axis=1),
+        "BCa": (drawn[at, ranks[0]], drawn[at, ranks[1]]),
+        "studentized": (means - t_high * errors, means - t_low * errors),
+    }
+    return {name: float(((low <= 0) & (high >= 0)).mean()) for name, (low, high) in intervals.items()}
+
+
+def percent(share: float) -> str:
+    """A share in percent, as the tables print it."""
+    return f"{100 * share:.1f}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the tables and the JSON line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.decisions", description="how often verdicts are wrong")
+    parser.add_argument("--simulations", type=int, default=2_000, help="comparisons in each cell")
+    count = parser.parse_args(arguments).simulations
+    rng = np.random.default_rng(0)
+    plan = Plan()
+
+    began = time.perf_counter()
+    for groups, follow in product(GROUPS, USERS.values()):
+        for values in normal(rng, (10, groups, SEEDS)):
+            follow(values, plan)
+    minutes = (time.perf_counter() - began) / 10 * count * 5 / 60  # the work of five shapes, roughly
+    margin = 196 * np.sqrt(0.05 * 0.95 / count)
+    print(f"{count:,} comparisons in a cell, so 5 % are known to {margin:.1f}; about {minutes:.1f} minutes", flush=True)
+
+    wrong = {
+        f"{shape}, {groups} groups": {
+            user: float(np.mean([false_decision(values, plan, follow) for values in drawn[:: 4 if looks_often else 1]]))
+            for drawn in [draw(rng, (count, groups, SEEDS))]
+            for user, follow in USERS.items()
+            for looks_often in [follow is every_seed]  # three times the work, and far from 5 %
+        }
+        for (shape, draw), groups in product(SHAPES.items(), GROUPS)
+    }
+    print_table(
+        "comparisons of equal groups that decide anything, in % (at most 5)",
+        ("", *USERS),
+        [(cell, *map(percent, users.values())) for cell, users in wrong.items()],
+    )
+
+    single = Plan(looks=(SEEDS,))
+    power = {}
+    for (shape, draw), groups, difference in product(SHAPES.items(), GROUPS, (1, 2)):
+        drawn = draw(rng, (count if groups == 2 else count // 4, groups, SEEDS))
+        drawn[:, 0] += difference
+        share, seeds = np.mean([found(values, plan) for values in drawn], axis=0)
+        at_once = np.mean([found(values, single) for values in drawn], axis=0)[0]
+        power[f"{shape}, {groups} groups, {difference} sd"] = {
+            "power": float(share),
+            "seeds": float(seeds),
+            "power_at_ten": float(at_once),
+        }
+    print_table(
+        "one group better than all others: its pairs found in %, its mean seeds; and by one look at ten seeds",
+        ("", "found", "seeds", "found at ten"),
+        [(cell, percent(x["power"]), f"{x['seeds']:.1f}", percent(x["power_at_ten"])) for cell, x in power.items()],
+    )
+
+    plans = {"5 and 10": plan, "10": single, "10 and 20": Plan(looks=(10, 20))}
+    mixtures = {
+        "bimodal 70:30 and steady": (bimodal, steady),
+        "three bimodal 70:30 and steady": (bimodal, bimodal, bimodal, steady),
+        "log-normal and normal": (lognormal, normal),
+        "normal and steady": (normal, steady),
+    }
+    shapes = {}
+    for mixture, draws in mixtures.items():
+        drawn = np.stack([draw(rng, (count, 2 * SEEDS)) for draw in draws], axis=1)
+        shapes[mixture] = {
+            looks: float(np.mean([false_decision(values, each, advised) for values in drawn]))
+            for looks, each in plans.items()
+        }
+    print_table(
+        "groups of one mean and different shapes that decide anything, in %, by the looks of the plan",
+        ("", *plans),
+        [(mixture, *map(percent, row.values())) for mixture, row in shapes.items()],
+    )
+
+    equivalent = {}
+    for (shape, draw), delta in product(SHAPES.items(), (1.0, 2.0)):
+        drawn = draw(rng, (count, 2, SEEDS))
+        apart = drawn + np.array([[delta], [0.0]])
+        said, at_delta = (
+            np.mean([advised(x, Plan(delta=delta))[0].verdicts[0].said == "equivalent" for x in values])
+            for values in (drawn, apart)
+        )
+        six = draw(rng, (count // 4, 6, SEEDS)) + delta * np.array([0, 1, 0, 1, 0, 1])[:, None]
+        mixed = np.mean([false_of_two_means(values, Plan(delta=delta)) for values in six])
+        equivalent[f"{shape}, delta {delta:g} sd"] = {
+            "of_one_mean": float(said),
+            "delta_apart": float(at_delta),
+            "six_groups": float(mixed),
+        }
+    print_table(
+        "two groups found equivalent within delta, and any false verdict on three groups and three delta above, in %",
+        ("", "of one mean", "delta apart (false)", "of six groups (false)"),
+        [(cell, *map(percent, row.values())) for cell, row in equivalent.items()],
+    )
+
+    coverage = {
+        f"mean, {shape}, {size} seeds": coverage_of_means(draw(rng, (count, size)), rng)
+        for (shape, draw), size in product(SHAPES.items(), (3, 5, 10))
+    }
+    print_table(
+        "95 % intervals of a group's mean that hold it, in %",
+        ("", "t (printed)", "percentile", "BCa", "studentized"),
+        [(cell, *map(percent, row.values())) for cell, row in coverage.items()],
+    )
+    for (shape, draw), groups, step in product(SHAPES.items(), GROUPS, (0.0, 1.0)):
+        means = step * np.arange(groups)
+        drawn = draw(rng, (count if groups == 2 else count // 4, groups, SEEDS)) + means[:, None]
+        one, every = np.mean([covered(values, means, plan) for values in drawn], axis=0)
+        cell = f"difference, {shape}, {groups} groups {step:g} sd apart"
+        coverage[cell] = {"one": float(one), "all": float(every)}
+    print_table(
+        "intervals of the verdicts that hold the true difference, in %: one of them, and all of a comparison",
+        ("", "one", "all"),
+        [(cell, *map(percent, row.values())) for cell, row in coverage.items() if cell.startswith("difference")],
+    )
+
+    print_results(
+        {
+            "simulations": count,
+            "worst_false_decision": max(share for users in wrong.values() for share in users.values()),
+            "false_decisions": wrong,
+            "power": {cell: [row["power"], row["power_at_ten"]] for cell, row in power.items()},
+            "seeds": {cell: row["seeds"] for cell, row in power.items()},
+            "different_shapes": shapes,
+            "equivalent": equivalent,
+            "coverage": coverage,
+            "seconds": round(time.perf_counter() - began),
+        }
+    )
+
+
+if __name__ == "__main__":
+    main()

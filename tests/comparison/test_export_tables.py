@@ -1,0 +1,226 @@
+"""Tables as LaTeX and Parquet: what a paper or another program reads is what the table says."""
+
+import io
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from atlantis_exp.comparison.export_tables import UNITS, to_latex, to_parquet, unit, with_units
+from atlantis_exp.comparison.gather import gather, group
+from atlantis_exp.comparison.published import Table
+from atlantis_exp.comparison.report import COLUMNS, shown_columns
+from atlantis_exp.comparison.tables import compare
+from atlantis_exp.comparison.verdict import Question
+
+Recorded = Callable[..., Path]
+
+SCORES = {
+    "family": "model",
+    "group": "cnn",
+    "baseline": "resnet",
+    "seeds": 3,
+    "score": 12_345.6,
+    "low": 9_000.2,
+    "high": 1.5e9,
+    "difference": -1_500.25,
+    "difference_low": np.nan,
+    "difference_high": np.nan,
+    "said": "not decided",
+}
+EPISODES = {
+    "group": "cnn",
+    "runs": 3,
+    "episodes": 300,
+    "mean": -5.25,
+    "median": 2_000.0,
+    "low": 0.0,
+    "high": 4_000.0,
+    "points_per_frame": 3.456,
+    "time_cap_share": 0.125,
+    "human_normalised_mean": np.nan,
+}
+
+
+def body(latex: str) -> list[list[str]]:
+    """The cells of a tabular, header first."""
+    lines = re.findall(r"^(.*) \\\\$", latex, re.MULTILINE)
+    return [line.split(" & ") for line in lines]
+
+
+def shown(latex: str) -> str:
+    """What LaTeX prints for a cell, as far as this module writes any; anything else is an error."""
+    commands = {
+        r"\textbackslash{}": "\\",
+        r"\textasciicircum{}": "^",
+        r"\textasciitilde{}": "~",
+        r"\textless{}": "<",
+        r"\textgreater{}": ">",
+        r"\textbar{}": "|",
+        r"\symbol{34}": '"',
+        r"\symbol{96}": "`",
+        **{f"\\{letter}": letter for letter in "{}$&#%_"},
+        "{}": "",
+    }
+    pattern = "|".join(map(re.escape, commands))
+    assert not re.search(r"[\\{}$&#%_^~<>|\"`]", re.sub(pattern, "", latex)), latex
+    assert not re.search(r"--|,,|''", latex), latex
+    return re.sub(pattern, lambda found: commands[found[0]], latex)
+
+
+def test_a_table_of_the_page_has_its_columns_units_and_intervals() -> None:
+    latex = to_latex("scores", [SCORES])
+    header, row = body(latex)
+    assert dict(zip(header, row, strict=True)) == {
+        "group": "cnn",
+        "seeds": "3",
+        "score (points)": r"12,346 (9,000 to 1.5$\times10^{9}$)",
+        "difference (points)": "$-$1,500",
+        "verdict": "not decided",
+    }
+    assert latex.splitlines()[1:4:2] == [r"\begin{tabular}{lrrrl}", " & ".join(header) + r" \\"]
+    assert [line for line in latex.splitlines() if "rule" in line] == [r"\toprule", r"\midrule", r"\bottomrule"]
+
+
+def test_shares_are_in_percent_and_what_is_missing_is_a_dash() -> None:
+    header, row = body(to_latex("evaluation", [EPISODES]))
+    assert dict(zip(header, row, strict=True)) == {
+        "group": "cnn",
+        "runs": "3",
+        "episodes": "300",
+        "mean (points)": "$-$5.25",
+        "median (points)": "2,000",
+        "low (points)": "0",
+        "high (points)": "4,000",
+        "points per frame (points/frame)": "3.46",
+        r"at time cap (\%)": "12.5",
+        r"human-normalised (\%)": "--",
+    }
+
+
+def test_another_table_has_all_its_columns() -> None:
+    table = [{"axis": "flops", "group": "a", "x": 2e12, "score": 70.5, "low": 1, "high": 2, "epsilon": 0.05}]
+    header, row = body(to_latex("curves", table))
+    assert header == ["axis", "group", "x", "score (points)", "low (points)", "high (points)", "epsilon"]
+    assert row == ["flops", "a", r"2$\times10^{12}$ FLOPs", "70", "1", "2", "0.05"]
+
+
+def test_a_place_on_an_axis_has_the_unit_of_its_row() -> None:
+    row = {"leader": "a", "other": "b", "leader_score": 3.0, "other_score": 2.0, "difference": 1.0}
+    places = (("equal hours", 2.5), ("equal frames", 600.0))
+    table = [{"view": view, "at": at, **row, "low": 0.5, "high": 1.5} for view, at in places]
+    header, *rows = body(to_latex("views", table))
+    assert [cells[header.index("up to")] for cells in rows] == ["2.5 hours", "600 frames"]
+    assert [cells[header.index("difference (points)")] for cells in rows] == ["1 (0.5 to 1.5)"] * 2
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        r"\input{/etc/passwd}",
+        r"50% & $x_1^2$ #1 ~ {} \\",
+        "[2ex]",
+        "* after a line's end",
+        "a---b ''quoted'' \"too\" <<>> |x| ,, `",
+        "^^5cinput",
+        "Grüße, naïve Łukasz",
+    ],
+)
+def test_a_name_is_shown_and_not_run(name: str) -> None:
+    latex = to_latex("any", [{"name": name}])
+    ((_,), (cell,)) = body(latex)
+    assert shown(cell) == name
+    assert not cell.startswith(("[", "*"))
+
+
+@given(st.text())
+def test_any_text_is_one_balanced_cell_on_one_line(name: str) -> None:
+    latex = to_latex("any", [{"name": name, "after": 1}])
+    assert len(latex.splitlines()) == 8
+    _, (cell, after) = body(latex)
+    assert after == "1"
+    assert shown(cell) == " ".join(shown(cell).split())
+    assert len(cell.replace(r"\{", "").split("{")) == len(cell.replace(r"\}", "").split("}"))
+    assert shown(cell).replace(" ", "") == "".join(letter for letter in name if letter.isprintable() and letter != " ")
+
+
+def test_an_empty_table_is_empty() -> None:
+    assert to_latex("evaluation", []) == ""
+    assert with_units("evaluation", []) == []
+    assert pq.read_table(io.BytesIO(to_parquet("evaluation", []))).num_rows == 0
+
+
+def test_units_are_in_the_keys_but_where_the_key_is_the_unit() -> None:
+    row = {"run": "a", "iqm": 1.0, "frames": 2, "flops": 3, "hours": 4, "time_cap_share": 0.5}
+    assert with_units("runs", [row]) == [
+        {"run": "a", "iqm (points)": 1.0, "frames": 2, "flops": 3, "hours": 4, "time_cap_share (fraction)": 0.5}
+    ]
+    assert unit("improvement", "low") == "fraction"
+    assert unit("verdict", "low") == "points"
+
+
+def test_parquet_reads_back_equal_with_units() -> None:
+    table: Table = [
+        {"group": "a", "iqm": 1.25, "seeds": np.int64(3), "decided": True, "at": "", "mixed": 1, "next_look": None},
+        {"group": "b", "iqm": np.float64(2), "seeds": 4, "decided": False, "at": 600, "mixed": "x", "next_look": None},
+    ]
+    read = pq.read_table(io.BytesIO(to_parquet("mine", table)))
+    keys = ("group", "iqm (points)", "seeds", "decided", "at", "mixed", "next_look (seeds)")
+    rows = (("a", 1.25, 3, True, None, "1", None), ("b", 2.0, 4, False, 600, "x", None))
+    assert read.to_pylist() == [dict(zip(keys, row, strict=True)) for row in rows]
+    assert read.schema.field("iqm (points)").metadata == {b"unit": b"points"}
+    assert read.schema.metadata == {b"table": b"mine"}
+
+
+@pytest.fixture
+def tables(recorded: Recorded, tmp_path: Path) -> dict[str, Table]:
+    """Those of a comparison of two networks with two seeds each."""
+    for model, score in (("cnn", 1_000.0), ("resnet", 3_000.0)):
+        for seed in (0, 1):
+            recorded(f"model={model}", f"seed={seed}", scores=(score, score + 500 * seed, 2 * score), truncated=1)
+    gathered = gather(tmp_path)
+    return compare(gathered, group(gathered.trainings, ["model"]), Question(("model",))).tables
+
+
+def test_all_tables_of_a_comparison_become_latex_and_parquet(tables: dict[str, Table]) -> None:
+    for name, table in tables.items():
+        latex = to_latex(name, table)
+        if table:
+            header, *rows = body(latex)
+            assert len(rows) == len(table)
+            assert {len(row) for row in rows} == {len(header)}
+            assert len(header) == len(shown_columns(name, table) if name in COLUMNS else header)
+        read = pq.read_table(io.BytesIO(to_parquet(name, table))).to_pylist()
+        for told, row in zip(read, with_units(name, table), strict=True):
+            assert {key: value for key, value in told.items() if value is not None and value == value} == {
+                key: value for key, value in row.items() if value not in ("", None) and value == value
+            }
+
+
+def test_every_number_of_a_comparison_has_a_unit_or_a_name_that_says_what_it_counts(tables: dict[str, Table]) -> None:
+    counts = {"runs", "episodes", "episode", "seed", "seeds", "epsilon", "truncated", "at", "x", "decided"}
+    numbers = {
+        key
+        for table in tables.values()
+        for row in table
+        for key, value in row.items()
+        if isinstance(value, int | float)
+    }
+    assert numbers - counts <= UNITS.keys()
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs pdflatex")
+def test_latex_takes_it(tables: dict[str, Table], tmp_path: Path) -> None:
+    hostile = [{"name": r"\x{50% & $_1^2$ #1 ~} '' -- <|> `" + '"', "value": -1.0}, {"name": "[2ex]", "value": 1e12}]
+    texts = [to_latex(name, table[:5]) for name, table in {**tables, "hostile": hostile}.items()]
+    document = "\n\n".join([r"\documentclass{article}\usepackage{booktabs}\begin{document}", *texts, r"\end{document}"])
+    (tmp_path / "paper.tex").write_text(document, "utf-8")
+    command = ("pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex")
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)

@@ -1,0 +1,534 @@
+"""What a comparison is asked, what it answers, and what it remembers of its looks."""
+
+import csv
+import io
+import json
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from atlantis_exp.commands.compare import VERB
+from atlantis_exp.comparison import comparing
+from atlantis_exp.comparison.figures import draw
+from atlantis_exp.comparison.gather import PROTOCOL, Gathered, Training, gather, group
+from atlantis_exp.comparison.report import page, plain
+from atlantis_exp.comparison.tables import Comparison, compare, to_csv
+from atlantis_exp.comparison.verdict import Group, Question, answer, families, wanted
+from atlantis_exp.comparison.words import spent
+from atlantis_exp.decision import Look, mean_interval
+from atlantis_exp.faults import ConfigError
+from atlantis_exp.runs.episodes import EpisodeTable
+from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.runs.journal import Journal
+from atlantis_exp.statistics import interquartile_mean
+
+Recorded = Callable[..., Path]
+Run = Callable[..., str]
+
+STEADY = (0.0, 30.0, -20.0, 10.0, -30.0, 20.0, 5.0, -15.0, 25.0, -5.0)  # points around a group's score, one a seed
+
+
+def episodes(score: float, seed: int) -> tuple[float, ...]:
+    """Four episodes whose interquartile mean, but not mean, is the score and the seed's share of STEADY."""
+    score += STEADY[seed]
+    return (score - 400.0 - seed, score - 100.0, score + 100.0, score + 900.0 + seed)
+
+
+def of(model: str, seed: int, scores: Sequence[float], sampler: str = "uniform", **changes: Any) -> Training:
+    """A finished run without its folder."""
+    config = {
+        "model.name": model,
+        "sampler": sampler,
+        "seed": seed,
+        "env.id": "atlantis",
+        "budget.steps": None,
+        **{key: 0 for key in PROTOCOL if key != "env.id"},
+    }
+    size = len(scores)
+    frames = np.full(size, 100.0)
+    table = EpisodeTable(
+        ("NOOP",), np.arange(size), np.array(scores), frames / 4, frames, np.zeros(size), np.ones((size, 1, 2))
+    )
+    facts: dict[str, Any] = {"tags": {}, "policy": "", **changes}
+    science = {key: value for key, value in config.items() if key != "budget.steps"}
+    return Training(f"{model}-{sampler}-s{seed}", config, science, {}, table, **facts)
+
+
+def around(model: str, score: float, seeds: Iterable[int] = range(5), **changes: Any) -> list[Training]:
+    """Seeds of a model around a score."""
+    return [of(model, seed, episodes(score, seed), **changes) for seed in seeds]
+
+
+def compared(
+    runs: Sequence[Training],
+    *by: str,
+    record: Mapping[str, Sequence[Look]] | None = None,
+    now: bool = False,
+    **question: Any,
+) -> Comparison:
+    """What the comparison of some runs by some keys, or by model, says."""
+    by = by or ("model",)
+    return compare(Gathered(list(runs)), group(runs, by), Question(by, **question), record, now)
+
+
+def record_of(comparison: Comparison) -> dict[str, list[Look]]:
+    """What a comparison leaves to the next one."""
+    return {each.family.name: each.decision.looks for each in comparison.answers}
+
+
+@pytest.fixture
+def record_seeds(recorded: Recorded) -> Callable[..., list[Path]]:
+    """Writes the folders of seeds of a model around a score; those after the first as copies, which is faster."""
+
+    def record(model: str, score: float, seeds: Iterable[int] = range(5), **tags: str) -> list[Path]:
+        first = recorded(f"model={model}", "seed=77", scores=episodes(score, 0))
+        folders = []
+        for seed in seeds:
+            folder = shutil.copytree(first, first.with_name(f"{model}-{score:.0f}-s{seed}"))
+            config = json.loads((folder / "config.json").read_text())
+            (folder / "config.json").write_text(json.dumps({**config, "seed": seed}))
+            (path,) = folder.glob("artifacts/evaluation/*.csv")
+            table = replace(EpisodeTable.read(path), scores=np.array(episodes(score, seed)))
+            path.write_text(table.to_csv())
+            journal = Journal(folder)
+            journal.resume()
+            journal.tags({key.replace("_", "."): value for key, value in tags.items()})
+            journal.flush()
+            folders.append(folder)
+        shutil.rmtree(first)
+        return folders
+
+    return record
+
+
+@pytest.fixture
+def _undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages without figures, which take seconds."""
+    monkeypatch.setattr(comparing, "draw", lambda _: {})
+
+
+@pytest.fixture
+def run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs the verb and returns what it prints, on one line; `code` is the exit code that it must end with."""
+
+    def compared(*words: str, code: int = 0) -> str:
+        arguments = [f"paths.outputs={tmp_path}", "tracking=none", *words]
+        if code:
+            with pytest.raises(SystemExit, match=f"^{code}$"):
+                VERB.run(arguments)
+        else:
+            VERB.run(arguments)
+        shown = capsys.readouterr()
+        return " ".join((shown.err if code else shown.out).split())
+
+    return compared
+
+
+def the_folder(outputs: Path) -> Path:
+    (folder,) = (outputs / "comparisons").iterdir()
+    return folder
+
+
+def rows(folder: Path, table: str) -> list[dict[str, str]]:
+    with open(folder / "artifacts" / "tables" / f"{table}.csv") as file:
+        return list(csv.DictReader(file))
+
+
+# What is asked, and the one quantity that is decided.
+
+
+def test_the_verdict_the_tables_the_figure_and_the_page_show_one_quantity() -> None:
+    runs = [*around("cnn", 3_000.0), *around("resnet", 5_000.0)]
+    comparison = compared(runs, baseline="cnn")
+    expected = {
+        model: float(np.mean([interquartile_mean(run.episodes.scores) for run in runs if model in run.name]))
+        for model in ("cnn", "resnet")
+    }
+    scores = {row["group"]: row for row in comparison.tables["scores"]}
+    assert {name: row["score"] for name, row in scores.items()} == expected
+    assert expected != {row["group"]: row["mean"] for row in comparison.tables["evaluation"]}
+    difference = expected["resnet"] - expected["cnn"]
+    (verdict,) = comparison.tables["verdict"]
+    assert (verdict["group"], verdict["other"], verdict["said"]) == ("resnet", "cnn", "better")
+    assert verdict["difference"] == pytest.approx(difference)
+    assert scores["resnet"]["difference"] == verdict["difference"]
+    assert (scores["resnet"]["low"], scores["resnet"]["high"]) == mean_interval(
+        [row["score"] for row in comparison.tables["seeds"] if row["group"] == "resnet"]
+    )
+    figures = draw(comparison)
+    assert f"cnn {expected['cnn']:,.0f}, resnet {expected['resnet']:,.0f}" in figures["scores"].alt
+    assert f">{expected['resnet']:,.0f}<" in figures["scores"].svg
+    text = page(comparison, figures, {})
+    assert f"resnet plays better than cnn by {difference:,.0f} points" in comparison.verdict
+    assert comparison.verdict in text
+    assert f'<td class="number">{expected["cnn"]:,.0f} (' in text
+    (row, _) = csv.DictReader(io.StringIO(to_csv(comparison.tables["scores"])))
+    assert float(row["score"]) == expected["cnn"]
+
+
+def test_a_sweep_answers_for_each_key_averaged_over_the_other_and_for_all_groups() -> None:
+    runs = [
+        run
+        for model, sampler, score in product(("cnn", "resnet"), ("uniform", "top_half"), (3_000.0,))
+        for run in around(model, score + 2_000 * (model == "resnet") + 8 * (sampler == "uniform"), sampler=sampler)
+    ]
+    comparison = compared(runs, "model", "sampler")
+    model, _, groups = comparison.answers
+    assert [each.family.name for each in comparison.answers] == ["model", "sampler", "model,sampler"]
+    assert [each.family.plan.error for each in comparison.answers] == [0.05 / 3] * 3
+    assert model.family.seeds["cnn"] == {seed: pytest.approx(3_004 + STEADY[seed]) for seed in range(5)}
+    (verdict,) = model.decision.verdicts
+    assert (verdict.said, verdict.seeds) == ("worse", 5)
+    assert verdict.difference == pytest.approx(-2_000)
+    assert comparison.verdict.startswith("By model: resnet plays better than cnn by 2,000 points")
+    assert comparison.others[0].startswith("By sampler: Not decided: top_half against uniform (difference -8")
+    assert len(groups.decision.verdicts) == 6
+    assert [verdict.said for verdict in groups.decision.verdicts].count("not decided") == 2
+    assert "resnet top_half plays better than cnn top_half and than cnn uniform" in comparison.others[1]
+    assert [row["family"] for row in comparison.tables["scores"]] == ["model"] * 2 + ["sampler"] * 2 + [
+        "model,sampler"
+    ] * 4
+
+
+def test_unbalanced_groups_and_seeds_are_left_out_of_a_keys_answer_and_named() -> None:
+    runs = [
+        *around("cnn", 3_000.0, sampler="uniform"),
+        *around("cnn", 3_000.0, range(4), sampler="top_half"),
+        *around("resnet", 5_000.0, sampler="uniform"),
+        *around("resnet", 5_000.0, sampler="top_half"),
+        *around("tiny", 1_000.0, sampler="uniform"),
+    ]
+    comparison = compared(runs, "model", "sampler")
+    model, sampler, _ = (each.family for each in comparison.answers)
+    assert set(model.groups) == {"cnn", "resnet", "tiny"}
+    assert {group.label for group in model.groups["cnn"]} == {"cnn uniform"}
+    assert model.left_out == ["cnn top_half", "resnet top_half"]
+    assert sampler.left_out == ["tiny uniform"]
+    assert list(sampler.seeds["top_half"]) == [0, 1, 2, 3]
+    beside = " ".join(comparison.beside)
+    assert "By model, some groups do not count, for not all values have their like: cnn top_half" in beside
+    assert "By sampler, top_half goes without seed 4, which not all of its groups have." in beside
+
+
+def test_keys_that_share_no_value_are_not_answered_by_themselves() -> None:
+    runs = [*around("cnn", 3_000.0, sampler="uniform"), *around("resnet", 5_000.0, sampler="top_half")]
+    comparison = compared(runs, "model", "sampler")
+    assert [each.family.name for each in comparison.answers] == ["model,sampler"]
+    assert any(line.startswith("model is not answered by itself") for line in comparison.beside)
+    (each,) = comparison.answers
+    assert each.family.plan.error == 0.05
+
+
+def test_a_baseline_is_compared_with_each_other_one_and_the_table_gets_the_differences() -> None:
+    runs = [*around("cnn", 3_000.0), *around("resnet", 5_000.0), *around("tiny", 1_000.0)]
+    comparison = compared(runs, baseline="cnn")
+    assert [(row["group"], row["other"], row["said"]) for row in comparison.tables["verdict"]] == [
+        ("resnet", "cnn", "better"),
+        ("tiny", "cnn", "worse"),
+    ]
+    assert "tiny plays worse than cnn by 2,000 points (1," in comparison.verdict
+    header, cnn, resnet, tiny = plain("scores", comparison.tables["scores"])
+    assert header == ["group", "seeds", "score", "difference", "verdict"]
+    assert (cnn[3], resnet[3][:7], tiny[3][:8]) == ("", "2,000 (", "-2,000 (")
+    assert plain("scores", compared(runs).tables["scores"])[0] == ["group", "seeds", "score"]
+
+
+def test_a_baseline_may_be_a_value_of_a_key_or_a_group_and_nothing_else() -> None:
+    runs = [
+        run for model in ("cnn", "resnet") for s in ("uniform", "top_half") for run in around(model, 9.0, sampler=s)
+    ]
+    plans = [each.family.plan.baseline for each in compared(runs, "model", "sampler", baseline="uniform").answers]
+    assert plans == [None, "uniform", None]
+    plans = [each.family.plan.baseline for each in compared(runs, "model", "sampler", baseline="cnn uniform").answers]
+    assert plans == [None, None, "cnn uniform"]
+    (alone,) = compared(runs[:5] + runs[10:15], "model", "sampler", baseline="cnn").answers
+    assert alone.family.plan.baseline == "cnn uniform"
+    with pytest.raises(ConfigError, match=r"^baseline=cnm: no such group; did you mean 'cnn'\? \(valid: cnn, cnn top"):
+        compared(runs, "model", "sampler", baseline="cnm")
+    with pytest.raises(ConfigError, match=r"^baseline=cnn: there is one group only"):
+        compared(runs[:5], baseline="cnn")
+
+
+def test_the_beginning_of_a_commit_is_a_baseline_where_it_is_the_beginning_of_one_only() -> None:
+    commits = ("abcd00000000ffff", "abcd11111111ffff", "1234abcd1234ffff")
+    runs = [run for commit in commits for run in around("cnn", 9.0, tags={"git.commit": commit})]
+    for asked in ("abcd0", commits[0]):
+        (each,) = compared(runs, "git.commit", baseline=asked).answers
+        assert each.family.plan.baseline == "abcd000000"
+    with pytest.raises(ConfigError, match=r"^baseline=abcd: could be any of abcd000000, abcd111111$"):
+        compared(runs, "git.commit", baseline="abcd")
+    with pytest.raises(ConfigError, match=r"^baseline=123: no such group"):
+        compared(runs, "git.commit", baseline="123")
+
+
+# Looks.
+
+
+def test_fewer_than_five_seeds_never_decide_not_even_when_asked_to_look_now() -> None:
+    runs = [*around("cnn", 3_000.0, range(4)), *around("resnet", 9_000.0)]
+    for now in (False, True):
+        comparison = compared(runs, now=now)
+        assert comparison.verdict == "Not decided: cnn against resnet; next look at 5 seeds (cnn has 4)."
+        assert comparison.tables["looks"] == []
+    assert "look=now took no look" in comparison.beside[-1]
+    assert "cnn has 4 of the 5 seeds without which nothing is decided." in comparison.notes
+
+
+def test_looks_are_taken_where_they_are_planned_and_the_same_seeds_charge_nothing_again() -> None:
+    level = (0.0, 15.0)
+    seeds = 10
+
+    def runs(count: int) -> list[Training]:
+        return [
+            run
+            for model, more in zip(("cnn", "resnet"), level, strict=True)
+            for run in around(model, 3_000 + more, range(count))
+        ]
+
+    first = compared(runs(5))
+    (spent_first,) = (each.decision.spent for each in first.answers)
+    assert spent_first == 0.05 / 4
+    assert "next look at 10 seeds (there are 5 each)" in first.verdict
+    again = compared(runs(5), record=record_of(first))
+    assert record_of(again) == record_of(first)
+    assert again.verdict == first.verdict
+
+    between = compared(runs(7), record=record_of(first))
+    assert record_of(between) == record_of(first)
+    assert "difference -15" in between.verdict
+    assert "5 seeds each); next look at 10 seeds (there are 7 each)." in between.verdict
+    assert "more seeds" not in between.verdict
+    assert (
+        "Verdicts rest on the seeds of their looks, scores are of all seeds there are: cnn has 7, resnet has 7."
+        in between.beside
+    )
+
+    last = compared(runs(seeds), record=record_of(between))
+    (each,) = last.answers
+    assert [look.size for look in each.decision.looks] == [5, 10]
+    assert each.decision.spent == pytest.approx(0.05)
+    assert "and there is no further look; a difference of" in last.verdict
+    assert "would have been found with 80 %." in last.verdict
+    assert [(row["look"], row["seeds"]) for row in last.tables["looks"]] == [(1, 5), (2, 10)]
+    widths = [row["high"] - row["low"] for row in last.tables["looks"]]
+    assert widths[1] < widths[0]
+
+
+def test_a_look_that_nobody_planned_is_charged_and_said() -> None:
+    runs = [*around("cnn", 3_000.0, range(7)), *around("resnet", 3_015.0, range(7))]
+    first = compared([run for run in runs if run.config["seed"] < 5])
+    comparison = compared(runs, record=record_of(first), now=True)
+    (each,) = comparison.answers
+    assert [look.size for look in each.decision.looks] == [5, 7]
+    charged = 0.05 * (0.49 - 0.25)
+    assert each.decision.looks[1].error == pytest.approx(charged)
+    said = f"By model, a look was taken at 7 seeds, where none was planned: it spent {charged:.2%} of the error."
+    assert said in comparison.beside
+    assert spent(each) == "looks planned at 5 and 10 seeds; taken: 5, 7; error spent: 2.45% of 5.00%"
+    assert comparison.tables["plan"][0]["taken"] == "5 7"
+
+
+def test_a_difference_within_delta_is_a_verdict_too() -> None:
+    runs = [*around("cnn", 3_000.0, range(10)), *around("resnet", 3_015.0, range(10))]
+    share = compared(runs, delta=0.05, relative=True)
+    assert share.verdict.startswith("cnn is as good as resnet: no difference larger than 5 % (-")
+    assert compared(runs, delta=200.0).tables["verdict"][0]["said"] == "equivalent"
+    assert "larger than 200 points" in compared(runs, delta=200.0).verdict
+    assert compared(runs, delta=1.0).tables["verdict"][0]["said"] == "not decided"
+
+
+def test_scores_that_are_no_numbers_are_left_out(recorded: Recorded, tmp_path: Path) -> None:
+    folder = recorded(scores=(1_000.0, float("nan")))
+    assert "has a score that is no finite number" in gather(tmp_path).skipped[folder.name]
+
+
+def test_the_seeds_that_the_next_look_wants_are_named_group_by_group() -> None:
+    groups = [
+        Group(("cnn", "uniform"), {0: 1.0, 1: 2.0, 4: 3.0}),
+        Group(("cnn", "top_half"), {0: 1.0, 1: 2.0}, same={2: 0}),
+        Group(("resnet", "uniform"), dict.fromkeys(range(5), 1.0)),
+    ]
+    answers = answer(families(groups[::2], Question(("model", "sampler"))), {})
+    assert wanted(answers) == {"cnn uniform": [2, 3]}
+    answers = answer(families(groups[:2], Question(("model", "sampler"))), {})
+    assert wanted(answers) == {"cnn top_half": [3, 4, 5], "cnn uniform": [2, 3]}
+    decided = answer(families(groups[2:], Question(("model",))), {})
+    assert wanted(decided) == {}
+
+
+@pytest.mark.parametrize("shape", ["normal", "bimodal"])
+def test_whoever_follows_what_is_said_to_the_end_is_seldom_told_a_difference_that_is_none(shape: str) -> None:
+    rng, question, comparisons = np.random.default_rng(0), Question(("model", "sampler")), 400
+    labels = list(product(("cnn", "resnet"), ("uniform", "top_half")))
+    wrong = 0
+    for _ in range(comparisons):
+        values = rng.normal(size=(4, 10))
+        if shape == "bimodal":
+            values = (rng.random((4, 10)) < 0.7) + 0.1 * values
+        seeds: dict[str, list[int]] = {" ".join(label): list(range(5)) for label in labels}
+        record: dict[str, list[Look]] = {}
+        while any(seeds.values()):
+            trained = {label: (values[row], sorted(seeds[" ".join(label)])) for row, label in enumerate(labels)}
+            groups = [
+                Group(label, {seed: float(own[seed]) for seed in there}) for label, (own, there) in trained.items()
+            ]
+            answers = answer(families(groups, question), record)
+            record = {each.family.name: each.decision.looks for each in answers}
+            missing = wanted(answers)
+            if not missing:
+                break
+            seeds = {label: there + missing.get(label, []) for label, there in seeds.items()}
+        wrong += any(verdict.said != "not decided" for each in answers for verdict in each.decision.verdicts)
+    assert wrong / comparisons <= 0.05
+
+
+# What is said beside a verdict.
+
+
+def test_collapsed_policies_are_named_and_equal_scores_count_as_one_seed() -> None:
+    held = (2_000.0,) * 4
+    runs = [
+        *(of("cnn", seed, held, policy="collapsed: FIRE in 100.0% of the network's decisions") for seed in range(3)),
+        *around("cnn", 3_000.0, range(3, 5), policy="FIRE in 40.0% of the network's decisions"),
+        of("resnet", 0, held),
+        *around("resnet", 5_000.0, range(1, 5)),
+    ]
+    comparison = compared(runs)
+    (each,) = comparison.answers
+    assert list(each.family.seeds["cnn"]) == [0, 3, 4]
+    assert comparison.verdict == "Not decided: cnn against resnet; next look at 5 seeds (cnn has 3)."
+    beside = " ".join(comparison.beside)
+    assert "3 of 5 runs of cnn collapsed to one action" in beside
+    assert "cnn-uniform-s1 has the same score in every episode as cnn-uniform-s0: the two count as one seed." in beside
+    assert "cnn and resnet have runs with the same score in every episode: cnn-uniform-s0, resnet-uniform-s0." in beside
+    assert [row["same_as"] for row in comparison.tables["runs"]][:3] == ["", "cnn-uniform-s0", "cnn-uniform-s0"]
+    assert comparison.tables["evaluation"][0]["runs"] == 3
+
+
+def test_seeds_that_fall_into_modes_come_with_survival_and_points_per_frame() -> None:
+    runs = [*around("cnn", 5_000.0, range(4)), *around("cnn", 1_000.0, [4, 5]), *around("resnet", 5_000.0, range(6))]
+    comparison = compared(runs)
+    (row,) = comparison.tables["modes"]
+    assert (row["group"], row["upper_share"]) == ("cnn", pytest.approx(4 / 6))
+    assert row["upper_score"] == pytest.approx(5_005)
+    (evaluation, _) = comparison.tables["evaluation"]
+    scores = np.concatenate([run.episodes.scores for run in runs[:6]])
+    assert row["points_per_frame"] == evaluation["points_per_frame"] == pytest.approx(scores.mean() / 100)
+    assert any(line.startswith("cnn falls into two modes: 67% of its seeds score 5,005") for line in comparison.beside)
+    assert "in the upper mode" in page(comparison, {}, {})
+
+
+def test_runs_of_different_precisions_or_devices_are_named() -> None:
+    runs = [
+        *around("cnn", 3_000.0, tags={"precision": "bfloat16", "device": "cpu"}),
+        *around("resnet", 5_000.0, tags={"precision": "float32", "device": "cpu"}),
+    ]
+    beside = " ".join(compared(runs).beside)
+    assert "The runs were made in different precisions: bfloat16: cnn-uniform-s0, " in beside
+    assert "float32: resnet-uniform-s0" in beside
+    assert "devices" not in beside
+
+
+def test_who_leads_while_training_is_said_as_a_description() -> None:
+    def curve(end: float) -> dict[str, Any]:
+        return {"frames": np.array([0.0, 100.0]), "epsilon": np.zeros(2), "score": np.array([0.0, end])}
+
+    runs = [
+        replace(run, curve=curve(end + STEADY[run.config["seed"]]))
+        for model, end in (("cnn", 1_000.0), ("resnet", 2_000.0))
+        for run in around(model, 3_000.0)
+    ]
+    comparison = compared(runs)
+    assert "In training resnet leads at equal frames: a description, which nothing is decided by." in comparison.notes
+    (view,) = comparison.tables["views"]
+    assert (view["leader"], view["difference"]) == ("resnet", pytest.approx(1_000))
+    assert view["low"] < 1_000 < view["high"]
+    assert "decided" not in view
+    few = compared(runs[:3] + runs[5:8])
+    assert all(np.isnan(row["low"]) for row in (*few.tables["views"], *few.tables["curves"]))
+    assert len({row["run"] for row in few.tables["seed_curves"]}) == 6
+    assert comparison.tables["seed_curves"] == []
+
+
+# The verb.
+
+
+@pytest.mark.usefixtures("_undrawn")
+def test_the_same_question_of_more_seeds_is_the_same_comparison_and_remembers_its_looks(
+    record_seeds: Callable[..., list[Path]], run: Run, tmp_path: Path
+) -> None:
+    for model, score in (("cnn", 3_000.0), ("resnet", 3_015.0)):
+        record_seeds(model, score, policy="collapsed: FIRE in 99.9% of the network's decisions")
+    shown = run()
+    assert "next look at 10 seeds (there are 5 each)" in shown
+    assert "5 of 5 runs of cnn collapsed to one action" in shown
+    kept = (the_folder(tmp_path) / "looks.json").read_bytes()
+    assert "taken: 5; error spent: 1.25% of 5.00%" in run()
+    assert (the_folder(tmp_path) / "looks.json").read_bytes() == kept
+    for model, score in (("cnn", 3_000.0), ("resnet", 3_015.0)):
+        record_seeds(model, score, range(5, 10))
+    shown = run()
+    assert "taken: 5, 10; error spent: 5.00% of 5.00%" in shown
+    assert "would have been found with 80 %." in shown
+    assert [row["look"] for row in rows(the_folder(tmp_path), "looks")] == ["1", "2"]
+
+    with RunFolder(the_folder(tmp_path)).held():
+        assert " is held by process " in run(code=75)
+    path = the_folder(tmp_path) / "looks.json"
+    damage: tuple[Callable[[str], str], ...] = (
+        lambda text: text[:-20],
+        lambda _: "[" * 100_000,
+        lambda text: text.replace('"seeds": 5', '"seeds": "5"'),
+        lambda text: text.replace('"resnet"', '"tiny"'),
+        lambda text: text.replace('"error": 0.0125', '"error": 0.06'),
+        lambda text: text.replace('"model"', '"sampler"'),
+        lambda text: text.replace('"difference": -', '"difference": NaN, "was": -'),
+    )
+    whole = path.read_text()
+    for strike in damage:
+        path.write_text(strike(whole))
+        assert path.read_text() != whole
+        error = run(code=1)
+        assert error.startswith(f"atlantis_exp: {path} is no record of this comparison's looks (")
+        assert "Traceback" not in error
+    path.write_text(whole)
+    run("delta=5%")
+    assert len(list((tmp_path / "comparisons").iterdir())) == 2
+
+
+@pytest.mark.usefixtures("_undrawn")
+def test_a_worse_commit_ends_with_exit_code_1_and_one_line(record_seeds: Callable[..., list[Path]], run: Run) -> None:
+    old, new = "0123456789abcdef0123456789abcdef01234567", "fedcba9876543210fedcba9876543210fedcba98"
+    record_seeds("cnn", 5_000.0, git_commit=old)
+    for folder in record_seeds("cnn", 3_000.0, git_commit=new, git_dirty="true"):
+        folder.rename(folder.with_name(f"{folder.name}~1"))
+    error = run("by=git.commit", f"baseline={old[:7]}", code=1)
+    assert error.startswith(f"atlantis_exp: worse than the baseline {old[:7]}: {new[:10]} by 2,000 points (1,9")
+    assert "Traceback" not in error
+    assert "0123456789 plays better than fedcba9876 by 2,000 points" in run("by=git.commit")
+    assert "fedcba9876 plays better" not in run("by=git.commit", f"baseline={new}")
+    assert "baseline=abcdef: no such group" in run("by=git.commit", "baseline=abcdef", code=2)
+
+
+@pytest.mark.parametrize(
+    ("word", "line"),
+    [
+        ("baseline=cnm", "baseline=cnm: there is one group only"),
+        ("delta=-5%", "delta=-5%: write a share of a score, as in delta=5%, or points, as in delta=500"),
+        ("delta=0", "delta=0: write"),
+        ("seeds=4", "seeds=4: should be greater than or equal to 5"),
+        ("error=1", "error=1: should be less than 1"),
+        ("look=later", "look=later: no such choice; no valid choice is near (valid: due, now)"),
+    ],
+)
+def test_a_question_that_makes_no_sense_is_refused_in_one_line(
+    recorded: Recorded, run: Run, word: str, line: str
+) -> None:
+    recorded()
+    assert run(word, code=2).startswith(f"atlantis_exp: {line}")
