@@ -40,10 +40,10 @@ _CLOSED = ("seed", "resume", "device", "threads", "compile", "evaluation", "trac
 
 def _first_contender(arguments: list[str]) -> list[str]:
     """Give Hydra one value of each key that tells contenders apart, and no launcher: it composes, and runs nothing."""
-    texts, multirun = read_flags(arguments)
-    if multirun:
-        raise ConfigError("-m: decide plans its own sweeps; leave it out")
-    return [text for text in texts if text not in swept(arguments) and not text.startswith(("hydra/", "hydra."))]
+    if read_flags(arguments)[1]:
+        raise ConfigError("-m: decide plans its own sweeps; drop -m")
+    dropped = (*swept(arguments), *(text for text in arguments if text.startswith(("hydra/", "hydra."))))
+    return [argument for argument in arguments if argument not in dropped]
 
 
 def _work(asked: Asked[DecideConfig]) -> Callable[[], None]:

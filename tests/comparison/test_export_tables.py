@@ -199,7 +199,7 @@ def test_all_tables_of_a_comparison_become_latex_and_parquet(tables: dict[str, T
             assert len(header) == len(shown_columns(name, table) if name in COLUMNS else header)
         read = pq.read_table(io.BytesIO(to_parquet(name, table))).to_pylist()
         for told, row in zip(read, with_units(name, table), strict=True):
-            assert {key: value for key, value in told.items() if value is not None and value == value} == {
+            assert {key: value for key, value in told.items() if value not in ("", None) and value == value} == {
                 key: value for key, value in row.items() if value not in ("", None) and value == value
             }
 
