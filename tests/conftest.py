@@ -1,3 +1,4 @@
+import logging
 import os
 import shutil
 import signal
@@ -107,6 +108,14 @@ def mlflow_tables(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], 
         aside.unlink()
 
     return put
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _logs_stay_open() -> Iterator[None]:
+    """A command in this process closes no handler of others: with absl's, which a peer may bring, goes pytest's stderr."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(logging, "shutdown", lambda *_: None)  # by which Hydra begins
+        yield
 
 
 _CONNECTION = Store.__dict__["_connection"]
