@@ -112,7 +112,7 @@ def mlflow_tables(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], 
 
 @pytest.fixture(scope="session", autouse=True)
 def _logs_stay_open() -> Iterator[None]:
-    """A command in this process closes no handler of others: with absl's, which a peer may bring, goes pytest's stderr."""
+    """A command in this process closes no handler of others: pytest's stderr would go with absl's."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(logging, "shutdown", lambda *_: None)  # by which Hydra begins
         yield
