@@ -205,7 +205,7 @@ def test_twelve_updates_on_the_same_transitions_make_the_same_weights(line: str)
 
 def assert_history_is_as_recorded(name: str, run: Path) -> None:
     """Bit for bit on a processor that was recorded; on any other, the same events with nearly the same values."""
-    events = history(run)
+    events = [{key: value for key, value in event.items() if key != "sha256"} for event in history(run)]  # not in 0.1.0
     digest = hashlib.sha256(json.dumps(events).encode()).hexdigest()[:16]
     recorded = golden("histories", name, {"sha256": {arithmetic(): digest}, "events": events})
     if arithmetic() in recorded["sha256"]:

@@ -25,7 +25,9 @@ OUTPUT = "output.txt"
 
 # Names of artifacts.
 EPISODES = "episodes.csv"  # of the training
-BEST_WEIGHTS, BEST_EPISODE = "best.safetensors", "best_episode.mp4"
+BEST_EPISODE = "best_episode.mp4"
+NETWORK = "network"
+"""The name of the models that are a training's networks."""
 EVALUATION, EVALUATION_REPORT = "evaluation/episodes.csv", "evaluation/report.txt"  # of a run that is one evaluation
 
 _HOLD_SECONDS = 2.0  # that a command waits for a run, which another may hold for a moment

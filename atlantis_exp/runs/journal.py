@@ -5,6 +5,7 @@ A run folder holds `journal.jsonl` (one record a line), `artifacts/` (the files 
 a checkpoint holds that state. A resumed run redoes what came later and journals it again, so nothing appears twice.
 """
 
+import hashlib
 import json
 import os
 import re
@@ -68,7 +69,7 @@ class Image:
 
 @dataclass(frozen=True)
 class Model:
-    """Weights as safetensors under `artifacts/`, with the metrics that they reached."""
+    """Weights as safetensors under `artifacts/`, with the metrics that they reached and the file's SHA-256."""
 
     name: str
     step: int
@@ -76,6 +77,11 @@ class Model:
     path: str
     values: dict[str, float]
     best: bool = False  # of all of its name so far
+    sha256: str = ""  # empty in journals of 0.1.0
+
+    def is_whole(self, content: bytes) -> bool:
+        """Whether a file's content is the one that was recorded, as far as that is known."""
+        return self.sha256 in ("", hashlib.sha256(content).hexdigest())
 
 
 Record = Metrics | Params | Tags | Artifact | Image | Model
@@ -221,12 +227,13 @@ class Journal:
     def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None:
         if set("/.") & set(name):
             raise ValueError(f"A model's name holds neither '/' nor '.': {name!r}")
-        path = f"models/{_name(name)}/{step}.safetensors"
+        path = model_file(_name(name), step)
         write_file(_inside(self._folder, path), content)
+        digest = hashlib.sha256(content).hexdigest()
         # MLflow charts a model's metrics on the run as well: with the time of the metrics just recorded they are the
         # same points, not second ones.
         values = {_name(key): float(value) for key, value in metrics.items()}
-        self._append(Model(name, step, self._time, path, values, best))
+        self._append(Model(name, step, self._time, path, values, best, digest))
 
     def status(self, status: Status, error: str = "") -> None:
         self._mark(replace(self._commit, status=status, error=error))
@@ -299,6 +306,11 @@ def commit_of(content: bytes) -> Commit:
 def commit_bytes(commit: Commit) -> bytes:
     """Returns the `commit.json` of a commit."""
     return _encode(asdict(commit)).encode()
+
+
+def model_file(name: str, step: int) -> str:
+    """The artifact with the weights of a model at a step."""
+    return f"models/{name}/{step}.safetensors"
 
 
 def adopt(folder: Path, parent: Path) -> None:

@@ -1,10 +1,12 @@
-"""The weights that a stored run has: of its last commit, or of its best evaluation."""
+"""The weights that a stored run has: of its last commit, or of its best evaluation as of that commit."""
+
+import hashlib
 
 import safetensors.torch
 
 from atlantis_exp.faults import Fault
-from atlantis_exp.runs.folder import BEST_WEIGHTS, RunFolder
-from atlantis_exp.runs.journal import Model, read
+from atlantis_exp.runs.folder import NETWORK, RunFolder
+from atlantis_exp.runs.journal import Model, model_file, read
 from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints
 
 
@@ -14,7 +16,7 @@ def stored_weights(run: RunFolder, weights: str) -> tuple[bytes, int]:
     A folder without checkpoints, as one that was brought from a server, has the weights of its evaluations.
 
     Raises:
-        Fault: where the run has no such weights.
+        Fault: where the run has no such weights, or they are not those that were committed.
     """
     try:
         state = Checkpoints(run.checkpoints, run.trained_config.identity()).load()
@@ -25,11 +27,23 @@ def stored_weights(run: RunFolder, weights: str) -> tuple[bytes, int]:
         stored = [model for model in models if weights == "latest" or model.best]
         if not stored:
             raise Fault(f"run {run.name} has neither a checkpoint nor an evaluation yet")
-        return run.artifact(stored[-1].path).read_bytes(), stored[-1].step
+        return _read(run, stored[-1].path, stored[-1].sha256), stored[-1].step
     if weights == "latest":
         learner = state["learner"]
         return safetensors.torch.save(learner.get("evaluated", learner["network"])), int(state["counters"]["steps"])
-    path = run.artifact(BEST_WEIGHTS)
-    if not path.exists():
+    step = int(state["best_step"])
+    if step < 0:
         raise Fault(f"run {run.name} has no evaluation yet, so no best weights; weights=latest has some")
-    return path.read_bytes(), int(state["best_step"])
+    return _read(run, model_file(NETWORK, step), state.get("best_sha256", "")), step
+
+
+def _read(run: RunFolder, path: str, sha256: str) -> bytes:
+    """An artifact with weights; an empty checksum, as 0.1.0 left it, is not checked."""
+    file = run.artifact(path)
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise Fault(f"run {run.name}: its weights cannot be read: {error}") from None
+    if sha256 not in ("", hashlib.sha256(content).hexdigest()):
+        raise Fault(f"run {run.name}: {file} is damaged, or newer than the run's last commit")
+    return content

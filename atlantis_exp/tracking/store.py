@@ -21,6 +21,7 @@ from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
+from urllib.parse import urlsplit
 from uuid import UUID, uuid5
 
 from pydantic import AliasChoices, Field, TypeAdapter, ValidationError
@@ -139,12 +140,16 @@ class Store:
         """Returns the files of a run or model, whose location the server names.
 
         Raises:
-            ValueError: where they are not behind the server: it may not name a place on this machine.
+            ValueError: where they are not behind the server: it may name no place on this machine, and no other server,
+                which would be sent this one's user and password.
         """
         from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
 
-        if not location.startswith("mlflow-artifacts:"):
+        place = urlsplit(location)
+        if place.scheme != "mlflow-artifacts":
             raise ValueError(f"its files are in {location}; only a server with --serve-artifacts gives them out")
+        if place.netloc not in ("", urlsplit(self.uri).netloc):
+            raise ValueError(f"its files are said to be on {place.netloc}, another server, which is not asked")
         return Files(get_artifact_repository(location, tracking_uri=self.uri))
 
     def prepare(self) -> None:
@@ -179,6 +184,8 @@ class Store:
         os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")  # seconds
         os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
         os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+        for way in ("UPLOAD", "DOWNLOAD"):  # files would go to, or come from, whatever address the server names
+            os.environ.setdefault(f"MLFLOW_ENABLE_PROXY_MULTIPART_{way}", "false")
         from mlflow import MlflowClient
 
         # Whatever fails in MLflow reaches us as an exception; its log would add a traceback to each.
@@ -496,6 +503,9 @@ class _Mirror:
     def send(self, record: Params | Tags | Artifact | Image | Model) -> None:
         if isinstance(record, Artifact | Image | Model) and not (self._artifacts / record.path).exists():
             _log.warning("%s is gone and cannot be published", self._artifacts / record.path)
+            return
+        if isinstance(record, Model) and not record.is_whole((self._artifacts / record.path).read_bytes()):
+            _log.warning("%s is not what was recorded and is not published", self._artifacts / record.path)
             return
         match record:
             case Params(values):

@@ -188,6 +188,8 @@ def _bring_files(
             if above not in listed:
                 listed[above] = files.names(above)
             content = files.read(there) if name in listed[above] else None
+        if isinstance(record, Model) and content is not None and not record.is_whole(content):
+            raise ValueError(f"{path} does not have the checksum that its journal gives it")
         if content is None:
             _log.warning("%s is not on the server and cannot be brought", folder / "artifacts" / path)
         else:

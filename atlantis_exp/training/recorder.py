@@ -4,6 +4,7 @@ Nothing of it is learned from. A metric of the training is added in `Recorder.cu
 `Evaluation.metrics`.
 """
 
+import hashlib
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from atlantis_exp.faults import RunFault
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.media import score_heatmap, score_histogram
 from atlantis_exp.replay.memory import ReplayMemory
-from atlantis_exp.runs.folder import BEST_EPISODE, BEST_WEIGHTS, EPISODES, evaluation_at
+from atlantis_exp.runs.folder import BEST_EPISODE, EPISODES, NETWORK, evaluation_at
 from atlantis_exp.runs.journal import Tracker
 from atlantis_exp.statistics import TABLE_COLUMNS
 from atlantis_exp.training.evaluation import Evaluation, Stopped
@@ -65,6 +66,7 @@ class Recorder:
         self.episodes: list[Played] = []
         self.best_mean = -np.inf  # of all evaluations
         self.best_step = -1
+        self.best_sha256 = ""  # of the weights evaluated there, as a file
         self.evaluations = 0
         self.evaluated_at = -1  # steps
         self.evaluation_pending = False  # of this very step: it was asked to stop; redone on resume
@@ -175,10 +177,10 @@ class Recorder:
         )
         results = {name: value for name, value in metrics.items() if name.startswith("evaluation/")}
         is_best = evaluation.summary.mean > self.best_mean
-        self.tracker.model("network", weights, step, results, best=is_best)
+        self.tracker.model(NETWORK, weights, step, results, best=is_best)
         if is_best:
             self.best_mean, self.best_step = evaluation.summary.mean, step
-            self.tracker.artifact(BEST_WEIGHTS, weights)
+            self.best_sha256 = hashlib.sha256(weights).hexdigest()
             self.tracker.tags({"best_evaluation": f"mean {evaluation.summary.mean:,.0f} at step {step}"})
             if video is not None:
                 self.tracker.artifact(BEST_EPISODE, video)
@@ -200,6 +202,7 @@ class Recorder:
             "evaluated_at": self.evaluated_at,
             "owes_evaluation": self.evaluation_pending,
             "best_step": self.best_step,
+            "best_sha256": self.best_sha256,
             "last_report": self.last_report,
             "last_metrics": self.last_metrics,
             "tracker": self.tracker.state_dict(),
@@ -211,6 +214,7 @@ class Recorder:
         self.best_mean = -np.inf if state["best_mean"] is None else state["best_mean"]
         self.evaluations, self.evaluated_at = state["evaluations"], state["evaluated_at"]
         self.evaluation_pending, self.best_step = state["owes_evaluation"], state["best_step"]
+        self.best_sha256 = state.get("best_sha256", "")  # 0.1.0 has none
         self.last_report, self.last_metrics = state["last_report"], state["last_metrics"]
         self.tracker.load_state_dict(state["tracker"])
 

@@ -1,3 +1,4 @@
+import hashlib
 import inspect
 import json
 import math
@@ -75,7 +76,10 @@ def test_what_is_committed_is_read_back_in_its_order(tmp_path: Path, clock: Call
         Tags({"mlflow.note.content": "two\nlines"}),
         Metrics(7, 1_500, {"train/score": 200.0}),
         Image("q/values", 7, 1_500, "images/q/values/7.png"),
-        Model("best", 7, 1_500, "models/best/7.safetensors", {"train/score": 200.0}),
+        Model(
+            *("best", 7, 1_500, "models/best/7.safetensors", {"train/score": 200.0}),
+            sha256=hashlib.sha256(b"weights").hexdigest(),
+        ),
         Artifact("report/index.html"),
     ]
     assert [

@@ -37,7 +37,7 @@ def test_exported_weights_score_what_their_card_says(
 
     card, weights = read_card(folder)
     assert card.precision == "float16"
-    best = safetensors.numpy.load_file(next(trained.glob("runs/*/artifacts/best.safetensors")))
+    best = safetensors.numpy.load_file(next(trained.glob(f"runs/*/artifacts/models/network/{card.step}.safetensors")))
     for name, array in safetensors.numpy.load(weights).items():
         np.testing.assert_array_equal(array, best[name].astype(np.float16))
     (trained_step,) = {int(path.stem) for path in trained.glob("runs/*/artifacts/evaluation/*.csv")} & {card.step}

@@ -8,7 +8,9 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import PIL.Image
@@ -276,6 +278,53 @@ def test_what_a_server_says_leads_nowhere_outside(
     assert "runs/fine/commit.json" in contents(laptop)
     assert not list(tmp_path.rglob("away"))
     assert {path.name for path in laptop.iterdir()} == {"runs", "mlflow.lock"}
+
+
+@pytest.fixture
+def stranger() -> Iterator[tuple[str, list[tuple[str, str | None]]]]:
+    """Another server's host and port, and what it was asked for: paths, each with the password that came with it."""
+    asked: list[tuple[str, str | None]] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            asked.append((self.path, self.headers["Authorization"]))
+            self.send_response(404)
+            self.end_headers()
+
+        do_POST = do_GET
+
+        def log_message(self, *_: object) -> None: ...
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as other:
+        Thread(target=other.serve_forever, daemon=True).start()
+        yield f"127.0.0.1:{other.server_address[1]}", asked
+        other.shutdown()
+
+
+@pytest.mark.parametrize("what", ["runs SET artifact_uri", "logged_models SET artifact_location"])
+def test_a_server_cannot_send_the_password_to_another_one(
+    what: str,
+    tmp_path: Path,
+    server: tuple[str, Path],
+    stranger: tuple[str, list[tuple[str, str | None]]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (host, asked), (uri, folder) = stranger, server
+    monkeypatch.setenv("MLFLOW_TRACKING_USERNAME", "ann")
+    monkeypatch.setenv("MLFLOW_TRACKING_PASSWORD", "secret")
+    name = f"elsewhere-{what.split()[0]}"
+    experiment = f"tracking.experiment={name}"
+    a_sweep_of_one(tmp_path / "outputs", name)
+    synced(tmp_path / "outputs", f"to={uri}", experiment)
+    with closing(sqlite3.connect(folder / "mlflow.db")) as database, database:
+        column = "run_uuid" if what.startswith("runs") else "source_run_id"
+        ours = "SELECT run_uuid FROM runs WHERE name = ?"
+        database.execute(f"UPDATE {what} = ? WHERE {column} IN ({ours})", (f"mlflow-artifacts://{host}/x", name))
+    with pytest.raises(Fault, match="1 of 2 runs failed"):
+        synced(tmp_path / "laptop", f"from={uri}", experiment)
+    assert f"its files are said to be on {host}, another server, which is not asked" in capsys.readouterr().err
+    assert asked == []
 
 
 def test_every_folder_of_the_outputs_is_published_and_stays_at_home(tmp_path: Path) -> None:

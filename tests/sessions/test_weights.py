@@ -1,60 +1,80 @@
-"""Which weights of a stored run are played."""
+"""Stored weights: those that the last commit speaks of, or none."""
 
-import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
-import safetensors.torch
-import torch
 
-from atlantis_exp.checking import to_dict
 from atlantis_exp.config import Config
-from atlantis_exp.faults import Fault
-from atlantis_exp.game.emulator import ACTIONS
+from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.training import train
 from atlantis_exp.sessions.weights import stored_weights
-from atlantis_exp.training.trainer import Trainer
+from atlantis_exp.training.checkpoint import Checkpoints
+from atlantis_exp.training.recorder import Recorder
+
+Command = Callable[..., int]
+Compose = Callable[..., Config]
 
 
-@pytest.mark.slow
-def test_a_run_without_checkpoints_plays_from_the_weights_of_its_evaluations(tiny: Callable[..., Config]) -> None:
-    config = tiny()
-    train(Job(config))
-    run = RunFolder.of(config)
-
-    def stored(weights: str) -> tuple[dict[str, list[Any]], int]:
-        content, step = stored_weights(run, weights)
-        return {name: tensor.tolist() for name, tensor in safetensors.torch.load(content).items()}, step
-
-    with_checkpoints = [stored("latest"), stored("best")]
-    shutil.rmtree(run.checkpoints)
-    assert [stored("latest"), stored("best")] == with_checkpoints
-    assert with_checkpoints[0][1] == 160
-    shutil.rmtree(run.path)
-    run.write_config(to_dict(config))
-    with pytest.raises(Fault, match="neither a checkpoint nor an evaluation"):
-        stored("latest")
+class Killed(BaseException): ...
 
 
-def test_with_an_average_it_is_what_is_evaluated_and_stored(
-    tiny: Callable[..., Config], started: Callable[[Config, Path], Trainer], tmp_path: Path
+@pytest.fixture
+def interrupted(tiny: Compose, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
+    """A run with the best evaluation at step 160, which was killed before it was committed; the commit is of 120."""
+    config = tiny("tracking.commit_episodes=1", "phase.quick.steps=160")
+    save, evaluate = Checkpoints.save, Recorder.evaluate
+
+    def saved(self: Checkpoints, state: Mapping[str, Any], memory: ReplayMemory) -> None:
+        if state["evaluated_at"] == 160:
+            raise Killed
+        save(self, state, memory)
+
+    def evaluated(self: Recorder, *arguments: Any) -> None:
+        self.best_mean = float("-inf")  # each evaluation is the best so far
+        evaluate(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoints, "save", saved)
+        patch.setattr(Recorder, "evaluate", evaluated)
+        with pytest.raises(Killed):
+            train(Job(config))
+    return RunFolder.of(config)
+
+
+def test_best_is_what_the_last_commit_says(interrupted: RunFolder) -> None:
+    files = interrupted.artifact("models/network")
+    assert {path.name for path in files.iterdir()} == {"80.safetensors", "160.safetensors"}
+    weights, step = stored_weights(interrupted, "best")
+    assert (step, weights) == (80, (files / "80.safetensors").read_bytes())
+    assert weights != (files / "160.safetensors").read_bytes()
+
+
+def test_best_of_the_commit_before_is_found_where_the_last_is_damaged(interrupted: RunFolder) -> None:
+    newest = max(interrupted.checkpoints.glob("[0-9]*"))
+    (newest / "state.json").write_bytes(b"{}")
+    weights, step = stored_weights(interrupted, "best")
+    assert (step, weights) == (80, interrupted.artifact("models/network/80.safetensors").read_bytes())
+
+
+@pytest.mark.parametrize("verb", ["export to={folder}/new", "evaluate weights=best tracking=none"])
+def test_a_flipped_byte_is_one_line(
+    verb: str, interrupted: RunFolder, command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The network holds one action, its average another."""
-    config = tiny("training.ema=10", "evaluation.epsilon=0", "budget.steps=1")
-    run = RunFolder(tmp_path)
-    run.write_config(to_dict(config))
-    trainer = started(config, tmp_path)
-    learner = trainer.learner
-    for network, action in ((learner.network, "RIGHTFIRE"), (learner.evaluated, "FIRE")):
-        with torch.no_grad():
-            [*network.parameters()][-1][ACTIONS.index(action)] += 1_000
-    trainer.run()
-    assert trainer.recorder.last_metrics["actions/FIRE"] == 1
-    average = safetensors.torch.save(learner.evaluated.state_dict())
-    assert average != safetensors.torch.save(learner.network.state_dict())
-    for weights in ("latest", "best"):
-        assert stored_weights(run, weights) == (average, 1)
+    file = interrupted.artifact("models/network/80.safetensors")
+    content = bytearray(file.read_bytes())
+    content[-7] ^= 1
+    file.write_bytes(content)
+    outputs = interrupted.path.parents[1]
+    assert command(*verb.format(folder=tmp_path).split(), f"paths.outputs={outputs}") == 1
+    assert f"{file} is damaged, or newer than the run's last commit\n" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_run_goes_on_with_the_best_of_its_last_commit(tiny: Compose, interrupted: RunFolder) -> None:
+    train(Job(tiny("tracking.commit_episodes=1", "phase.quick.steps=160")))
+    weights, step = stored_weights(interrupted, "best")
+    assert interrupted.artifact(f"models/network/{step}.safetensors").read_bytes() == weights

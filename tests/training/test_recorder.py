@@ -140,7 +140,7 @@ def test_the_pace_is_known_at_every_point_of_the_curve_whatever_was_evaluated_or
 def test_the_state_of_a_training_has_the_keys_that_stored_runs_have(small: Small, tmp_path: Path) -> None:
     trainer = small(tmp_path)
     recorded = {
-        *("episodes", "best_mean", "evaluations", "evaluated_at", "owes_evaluation", "best_step"),
+        *("episodes", "best_mean", "evaluations", "evaluated_at", "owes_evaluation", "best_step", "best_sha256"),
         *("last_report", "last_metrics", "tracker"),
     }
     assert set(trainer.recorder.state_dict()) == recorded
