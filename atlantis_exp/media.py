@@ -38,7 +38,7 @@ def score_histogram(scores: Sequence[float], title: str) -> bytes:
     axes.set_yscale("function", functions=(np.sqrt, np.square))
     axes.set_ylim(0, 1)
     axes.set_yticks([0, 0.05, 0.25, 0.5, 1], ["0", "5 %", "25 %", "50 %", "100 %"])
-    axes.set_title(title, fontsize=8)
+    axes.set_title(title, fontsize=8, parse_math=False)
     axes.set_xlabel(f"score (line: mean {np.mean(scores):,.0f})", fontsize=7)
     return _png(figure)
 

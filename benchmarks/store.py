@@ -19,8 +19,9 @@ from atlantis_exp.commands.compare import VERB as COMPARE
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.commands.report import VERB as REPORT
 from atlantis_exp.commands.sync import VERB as SYNC
+from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import Result, RunFolder, evaluation_at
-from atlantis_exp.runs.journal import Commit, commit_bytes, read_commit, write_file
+from atlantis_exp.runs.journal import Commit, commit_bytes, read_commit
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.sweep import ledger
 from atlantis_exp.tracking.store import Cursor, Store, files_digest, small_files

@@ -1,9 +1,8 @@
 """Run folders to runs that can be compared; what cannot be is named with its reason."""
 
 import json
-import mmap
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -16,8 +15,9 @@ from atlantis_exp.checking import flatten, nearest, parse, to_dict
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.episodes import EpisodeTable
+from atlantis_exp.runs.facts import read_facts
 from atlantis_exp.runs.folder import EVALUATION, RESULT, RunFolder, evaluation_at
-from atlantis_exp.runs.journal import Tags, curve, read, read_commit
+from atlantis_exp.runs.journal import curve
 
 Array = npt.NDArray[np.float64]
 
@@ -225,7 +225,7 @@ def _training(
 ) -> Training:
     points = np.array([[record.values[key] for key in _CURVE.values()] for record in curve(folder.path, _POINT)])
     arrays = dict(zip(_CURVE, points.T, strict=True)) if len(points) else {}
-    tags = _tags(folder.path)
+    tags = read_facts(folder.path).tags
     if (updates := arrays.pop("updates", None)) is not None and "flops_per_update" in tags:
         arrays["flops"] = updates * float(tags["flops_per_update"])
 
@@ -242,7 +242,7 @@ def _training(
         wanted = "" if epsilon is None else f" at epsilon {epsilon}"
         raise _Unusable(f"no evaluation{wanted} after its last step: evaluate run={folder.name} makes one")
     taken, player, path = tables[-1]
-    policy = (tags if player == folder else _tags(player.path)).get("policy", "")
+    policy = (tags if player == folder else read_facts(player.path).tags).get("policy", "")
     science = config.science()
     science["phase"] = {str(index): phase for index, phase in enumerate(science["phase"])}
     leaves = flatten(to_dict(config)) | {"evaluation.epsilon": taken}
@@ -250,33 +250,6 @@ def _training(
     if not np.isfinite(episodes.scores).all():
         raise ValueError(f"{path} has a score that is no finite number")
     return Training(folder.name, leaves, flatten(science), arrays, episodes, tags, policy)
-
-
-def _tags(folder: Path) -> dict[str, str]:
-    """What a run's journal says about the run; of a long one no other lines are parsed."""
-    commit = read_commit(folder)
-    tags: dict[str, str] = {}
-    if commit is None or not commit.offset:
-        return tags
-    with (
-        open(folder / "journal.jsonl", "rb") as file,
-        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as journal,
-    ):
-        for start in _tag_lines(journal, commit.offset):
-            for _, record in read(folder, start, start + 1):
-                tags |= record.values if isinstance(record, Tags) else {}
-    return tags
-
-
-def _tag_lines(journal: mmap.mmap, end: int) -> Iterator[int]:
-    """Where the lines with tags begin."""
-    kind = b'{"kind":"tags",'
-    if journal[: len(kind)] == kind:
-        yield 0
-    newline = journal.find(b"\n" + kind, 0, end)
-    while newline >= 0:
-        yield newline + 1
-        newline = journal.find(b"\n" + kind, newline + 1, end)
 
 
 def _evaluations(outputs: Path) -> dict[str, list[tuple[int, dict[str, Any], RunFolder]]]:

@@ -11,11 +11,11 @@ from pydantic import TypeAdapter, ValidationError
 from atlantis_exp.comparison.verdict import Answer, Family
 from atlantis_exp.decision import FEWEST_SEEDS, Look
 from atlantis_exp.faults import Fault
-from atlantis_exp.runs.journal import write_file
+from atlantis_exp.runs.files import SMALL, read_file, write_file
 
 LOOKS = "looks.json"
 
-_MOST_BYTES = 16 * 2**20
+
 _RECORD = TypeAdapter(dict[str, list[Look]])
 
 Record = dict[str, list[Look]]
@@ -32,9 +32,7 @@ def read_looks(folder: Path, families: Sequence[Family]) -> Record:
     if not path.exists():
         return {}
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise ValueError(f"it has more than {_MOST_BYTES:,} bytes")
-        record = _RECORD.validate_json(path.read_bytes(), strict=True)
+        record = _RECORD.validate_json(read_file(path, SMALL), strict=True)
         if unknown := record.keys() - {family.name for family in families}:
             raise ValueError(f"it has looks at {min(unknown)!r}")
         for family in families:

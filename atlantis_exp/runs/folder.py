@@ -7,13 +7,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, Self, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from atlantis_exp.checking import nearest, parse
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs import lock
-from atlantis_exp.runs.journal import Commit, Status, read_commit, write_file
+from atlantis_exp.runs.files import SMALL, read_file, write_file
+from atlantis_exp.runs.journal import Commit, Status, read_commit
 
 CONFIG, RESULT, COMMIT = "config.json", "result.json", "commit.json"
 TRACEBACK = "traceback.txt"
@@ -195,8 +196,8 @@ def find_run(outputs: Path, name: str) -> RunFolder:
 
 def _read(path: Path, schema: TypeAdapter[T]) -> T | None:
     try:
-        return schema.validate_json(path.read_bytes(), strict=True) if path.exists() else None
-    except ValidationError:
+        return schema.validate_json(read_file(path, SMALL), strict=True) if path.exists() else None
+    except ValueError:
         raise Fault(f"{path} is damaged: remove it and issue the run's command again, which writes it anew") from None
 
 

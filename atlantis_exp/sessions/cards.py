@@ -17,6 +17,7 @@ from atlantis_exp.build import build_network_actor
 from atlantis_exp.checking import nearest, parse, to_dict
 from atlantis_exp.config import STRICT, Config, EvaluationConfig, PathsConfig
 from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.runs.files import SMALL, read_file, read_object
 from atlantis_exp.statistics import interval, resample, summarize
 from atlantis_exp.training.actor import Actor
 from atlantis_exp.training.evaluation import Evaluation
@@ -58,13 +59,13 @@ def read_card(folder: Path) -> tuple[Card, bytes]:
             f"weights={folder}: no folder with a card.json; {nearest(str(folder), {'latest', 'best'} | others)}"
         )
     try:
-        tree = json.loads(path.read_bytes())
-        if not isinstance(tree, dict):
-            raise ConfigError("should be an object")
-        card = parse(Card, tree)
-    except ValueError as error:
+        card = parse(Card, read_object(read_file(path, SMALL)))
+    except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: {error}") from None
-    weights = (folder / "weights.safetensors").read_bytes()
+    try:
+        weights = read_file(folder / "weights.safetensors", MOST_BYTES)
+    except (OSError, ValueError) as error:
+        raise Fault(f"{folder}: its weights cannot be read: {error}") from None
     if hashlib.sha256(weights).hexdigest() != card.sha256:
         raise Fault(f"{folder / 'weights.safetensors'} does not have the checksum of its card")
     return card, weights

@@ -6,8 +6,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
+from atlantis_exp import terminal
 from atlantis_exp.build import build_baseline, build_evaluator, build_network_actor, build_person
 from atlantis_exp.checking import digest, flatten, to_dict
 from atlantis_exp.config import BaselineAgentConfig, EnvConfig, EvaluationConfig, PathsConfig, TrackingConfig
@@ -73,7 +72,7 @@ def evaluate(
     _record(recorded, facts, played, tracking, outputs, shown, command)
     if card:
         table = side_by_side(card, evaluation, [episode.score for episode in played[0].episodes])
-        Console(highlight=False, width=max(Console().width, 130)).print(table)
+        terminal.console(least=130).print(table)
 
 
 def play_baseline(

@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from atlantis_exp import terminal
 from atlantis_exp.runs.folder import RunFolder, State
 from atlantis_exp.runs.journal import Metrics, read, read_commit
 from atlantis_exp.sessions.job import Job
@@ -78,7 +79,7 @@ class LiveTable:
     """Shows what the folders of a sweep's runs say; `look` is to be called every `seconds`."""
 
     def __init__(self, jobs: Sequence[Job], folders: Sequence[RunFolder], console: Console | None = None) -> None:
-        self._console = console or Console(highlight=False, soft_wrap=True)
+        self._console = console or terminal.console()
         self._runs = [_run(job, folder) for job, folder in zip(jobs, folders, strict=True)]
         self._said: dict[str, tuple[str, ...]] = {}
         self._live: Live | None = None
@@ -113,7 +114,7 @@ class LiveTable:
             if self._said.get(name, (name, "missing", "", "", "", "")) != cells:
                 self._said[name] = cells
                 parts = [done, speed and f"{speed} steps/s", left and f"left {left}", score and f"last score {score}"]
-                self._console.print(f"  {state:12}{name}  {'  '.join(filter(None, parts))}", markup=False)
+                self._console.print(f"  {state:12}{name}  {'  '.join(filter(None, parts))}")
 
 
 def _run(job: Job, folder: RunFolder) -> _Run:

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
+from atlantis_exp import terminal
 from atlantis_exp.config import PathsConfig
 from atlantis_exp.runs.folder import all_runs
 from atlantis_exp.statistics import TABLE_COLUMNS
@@ -37,10 +37,9 @@ def report(*, paths: PathsConfig) -> None:
             f"{result.evaluation['actions/random_share']:.1%}",
             f"{scores['episodes']:.0f}",
         )
-    console = Console(highlight=False)
-    console = Console(highlight=False, width=max(console.width, 130))
+    console = terminal.console(least=130)
     console.print(table)
     for run in runs:
         if run.result is not None:
-            console.print(f"\n{run.name}\n{run.result.report}", markup=False)
-    console.print(f"\nthe MLflow UI: make ui, or python -m atlantis_exp ui paths.outputs={shown}", markup=False)
+            console.print(f"\n{run.name}\n{run.result.report}")
+    console.print(f"\nthe MLflow UI: make ui, or python -m atlantis_exp ui paths.outputs={shown}")

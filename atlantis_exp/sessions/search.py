@@ -25,9 +25,9 @@ from optuna.samplers import TPESampler
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
 from optuna.trial import FrozenTrial, TrialState
-from rich.console import Console
 from rich.table import Table
 
+from atlantis_exp import terminal
 from atlantis_exp.build import stream
 from atlantis_exp.checking import digest
 from atlantis_exp.config import TrackingConfig
@@ -287,10 +287,9 @@ class _Session:
         for trial in ranking[:_SHOWN]:
             values = (_short(trial.params[key]) for key in self.request.space)
             table.add_row(str(trial.number), f"{trial.value:,.0f}", *values, trial.user_attrs["run"])
-        console = Console(highlight=False)
-        console = Console(highlight=False, width=max(console.width, 130))
+        console = terminal.console(least=130)
         console.print(table)
-        console.print(f"\nthe best in full: {self.best_command()}", markup=False, soft_wrap=True)
+        console.print(f"\nthe best in full: {self.best_command()}", soft_wrap=True)
 
 
 class _Watch:

@@ -5,6 +5,7 @@ import hashlib
 import safetensors.torch
 
 from atlantis_exp.faults import Fault
+from atlantis_exp.runs.files import WEIGHTS, read_file
 from atlantis_exp.runs.folder import NETWORK, RunFolder
 from atlantis_exp.runs.journal import Model, model_file, read
 from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints
@@ -41,8 +42,8 @@ def _read(run: RunFolder, path: str, sha256: str) -> bytes:
     """An artifact with weights; an empty checksum, as 0.1.0 left it, is not checked."""
     file = run.artifact(path)
     try:
-        content = file.read_bytes()
-    except OSError as error:
+        content = read_file(file, WEIGHTS)
+    except (OSError, ValueError) as error:
         raise Fault(f"run {run.name}: its weights cannot be read: {error}") from None
     if sha256 not in ("", hashlib.sha256(content).hexdigest()):
         raise Fault(f"run {run.name}: {file} is damaged, or newer than the run's last commit")

@@ -24,8 +24,9 @@ from typing import TYPE_CHECKING, Annotated
 from urllib.parse import urlsplit
 from uuid import UUID, uuid5
 
-from pydantic import AliasChoices, Field, TypeAdapter, ValidationError
+from pydantic import AliasChoices, Field, TypeAdapter
 
+from atlantis_exp.runs.files import SMALL, WEIGHTS, open_file, read_file, write_file
 from atlantis_exp.runs.folder import COMMIT, CONFIG, RESULT, TRACEBACK
 from atlantis_exp.runs.journal import (
     Artifact,
@@ -38,7 +39,6 @@ from atlantis_exp.runs.journal import (
     commit_bytes,
     read,
     read_commit,
-    write_file,
 )
 from atlantis_exp.runs.lock import alone
 from atlantis_exp.tracking.views import experiment_tags
@@ -363,7 +363,7 @@ def small_files(folder: Path, commit: Commit, is_server: bool = True) -> dict[st
     A local store can read the folder and needs none but the commit.
     """
     names = [name for name in SMALL_FILES if is_server and (folder / name).exists()]
-    return {COMMIT: commit_bytes(commit), **{name: (folder / name).read_bytes() for name in names}}
+    return {COMMIT: commit_bytes(commit), **{name: read_file(folder / name, SMALL) for name in names}}
 
 
 def files_digest(files: Mapping[str, bytes]) -> str:
@@ -417,8 +417,8 @@ class Cursor:
     def read(cls, note: Path) -> "Cursor | None":
         """Returns what was noted; None also where that is damaged, since sending all again is harmless."""
         try:
-            return _CURSOR.validate_json(note.read_bytes(), strict=True)
-        except (FileNotFoundError, ValidationError):
+            return _CURSOR.validate_json(read_file(note, SMALL), strict=True)
+        except (FileNotFoundError, ValueError):
             return None
 
     def save(self, note: Path) -> None:
@@ -464,7 +464,7 @@ class _Mirror:
         """Sends committed bytes as they are; a file is named by where it begins, and may be sent again with more."""
         if start == end:
             return
-        with open(self._journal, "rb") as file:
+        with open_file(self._journal) as file:
             file.seek(start)
             while start < end:
                 content = file.read(min(CHUNK, end - start))
@@ -501,10 +501,10 @@ class _Mirror:
         self._send_tags(tags)
 
     def send(self, record: Params | Tags | Artifact | Image | Model) -> None:
-        if isinstance(record, Artifact | Image | Model) and not (self._artifacts / record.path).exists():
+        if isinstance(record, Artifact | Image | Model) and not (self._artifacts / record.path).is_file():
             _log.warning("%s is gone and cannot be published", self._artifacts / record.path)
             return
-        if isinstance(record, Model) and not record.is_whole((self._artifacts / record.path).read_bytes()):
+        if isinstance(record, Model) and not record.is_whole(read_file(self._artifacts / record.path, WEIGHTS)):
             _log.warning("%s is not what was recorded and is not published", self._artifacts / record.path)
             return
         match record:
@@ -538,7 +538,7 @@ class _Mirror:
         from PIL.Image import open as open_image
 
         name = image_name(self._run_id, record)
-        self._send_file(f"{name}.png", (self._artifacts / record.path).read_bytes())
+        self._send_file(f"{name}.png", read_file(self._artifacts / record.path, WEIGHTS))
         with open_image(self._artifacts / record.path) as image:
             self._client.log_image(self._run_id, compress_image_size(image), f"{name}+compressed.webp")
         self._send_tags({"mlflow.loggedImages": "True"})

@@ -15,6 +15,7 @@ from math import inf
 from pathlib import Path
 from typing import Literal, Self
 
+from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import COMMIT
 from atlantis_exp.runs.journal import (
     Artifact,
@@ -25,7 +26,6 @@ from atlantis_exp.runs.journal import (
     read,
     read_commit,
     restore,
-    write_file,
 )
 from atlantis_exp.tracking.store import (
     CHUNK,

@@ -15,7 +15,7 @@ from safetensors import SafetensorError
 
 from atlantis_exp.faults import RunFault
 from atlantis_exp.replay.memory import ReplayMemory
-from atlantis_exp.runs.journal import write_file
+from atlantis_exp.runs.files import CHECKPOINT, SMALL, read_file, read_object, write_file
 
 FORMAT = 1
 _SEGMENTS = 64  # of a full memory, about
@@ -78,7 +78,7 @@ class Checkpoints:
         faults = []
         for generation in sorted(self._generations(), reverse=True):
             try:
-                manifest = json.loads((self.folder / _name(generation) / "manifest.json").read_bytes())
+                manifest = read_object(read_file(self.folder / _name(generation) / "manifest.json", SMALL))
                 if manifest.pop("sha256") != _checksum(manifest):
                     raise ValueError("its manifest does not have its checksum")
                 self._refuse_foreign(manifest, generation)
@@ -128,13 +128,13 @@ class Checkpoints:
     def _read(self, name: str, checksums: Mapping[str, str]) -> dict[str, Any]:
         if not set(checksums) <= {"state.json", "tensors.safetensors", "arrays.safetensors"} or ".." in name:
             raise ValueError("its manifest names files that no checkpoint has")
-        contents = {file: (self.folder / name / file).read_bytes() for file in checksums}
+        contents = {file: read_file(self.folder / name / file, CHECKPOINT) for file in checksums}
         for file, content in contents.items():
             if hashlib.sha256(content).hexdigest() != checksums[file]:
                 raise ValueError(f"{name}/{file} does not have its checksum")
         tensors = safetensors.torch.load(contents["tensors.safetensors"]) if "tensors.safetensors" in contents else {}
         arrays = safetensors.numpy.load(contents["arrays.safetensors"]) if "arrays.safetensors" in contents else {}
-        tree: dict[str, Any] = _assemble(json.loads(contents["state.json"]), tensors, arrays)
+        tree: dict[str, Any] = _assemble(read_object(contents["state.json"]), tensors, arrays)
         return tree
 
     def _clean(self, generation: int, segments: set[str]) -> None:

@@ -14,6 +14,7 @@ from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
+from atlantis_exp import terminal
 from atlantis_exp.statistics import EARLY_FRAMES, RANDOM_SCORE
 
 if TYPE_CHECKING:
@@ -81,13 +82,13 @@ class Progress:
     """Shows episode, score, mean of 20, epsilon, steps a second, phase and time left."""
 
     def __init__(self, console: Console | None = None) -> None:
-        self.console = console or Console(highlight=False, soft_wrap=True)
+        self.console = console or terminal.console()
         self._shown: float | None = None  # time
         self._live: Live | None = None
 
     def say(self, text: str) -> None:
         """A line of its own."""
-        self.console.print(text, markup=False)
+        self.console.print(text)
 
     def is_due(self) -> bool:
         """Whether it is time for `show`: a few times a second on a terminal, now and then elsewhere."""

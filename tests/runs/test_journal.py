@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.journal import (
     Artifact,
     Image,
@@ -30,7 +31,6 @@ from atlantis_exp.runs.journal import (
     curve,
     read,
     read_commit,
-    write_file,
 )
 
 

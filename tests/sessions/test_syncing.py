@@ -20,8 +20,9 @@ from hydra import compose, initialize_config_dir
 from atlantis_exp.commands.composing import CONF, checked
 from atlantis_exp.commands.sync import SyncConfig
 from atlantis_exp.faults import Fault
+from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import Result, RunFolder
-from atlantis_exp.runs.journal import Commit, Journal, adopt, commit_bytes, read_commit, write_file
+from atlantis_exp.runs.journal import Commit, Journal, adopt, commit_bytes, read_commit
 from atlantis_exp.sessions.syncing import sync
 from atlantis_exp.tracking import travel
 from atlantis_exp.tracking.publishing import catch_up

@@ -1,0 +1,56 @@
+"""Files of run folders: put in place whole, and read within bounds, since whatever is read may be anybody's."""
+
+import os
+import stat
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from pydantic_core import from_json
+
+SMALL = 2**24  # bytes; what a run says of itself has some kilobytes
+TABLE = 2**28  # bytes, of an evaluation's episodes
+WEIGHTS = 2**31  # bytes, of one network; any other artifact is smaller
+CHECKPOINT = 2**36  # bytes, of a whole replay memory
+
+
+def open_file(path: Path) -> BinaryIO:
+    """Open a regular file for reading. Raises: OSError, ValueError where it is of another kind."""
+    # Without blocking: a pipe would wait until somebody writes to it.
+    file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise ValueError(f"{path} is no regular file")
+    return file
+
+
+def read_file(path: Path, most: int) -> bytes:
+    """The content of a regular file of at most so many bytes. Raises: OSError, ValueError."""
+    with open_file(path) as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise ValueError(f"{path} has more than {most:,} bytes")
+    return content
+
+
+def read_object(content: bytes) -> dict[str, Any]:
+    """The object that JSON holds, of bounded depth. Raises: ValueError."""
+    tree = from_json(content)  # has a bound of its own, where `json` ends in RecursionError
+    if not isinstance(tree, dict):
+        raise ValueError(f"should be an object, is {type(tree).__name__}")
+    return tree
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Put a file in place whole, durably, or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(path.name + ".aside")
+    with open(aside, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    aside.replace(path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
