@@ -6,3 +6,10 @@ SMALLEST_SIDE = {
     "resnet_fast": 8,  # 8 -> 1
 }
 """The pixels a side that a network's unpadded convolutions need."""
+
+SOURCES = ("centre_vessel", "side_vessel", "centre_bomber", "side_bomber", "wave_bonus")
+"""What pays points in Atlantis.
+
+A vessel pays 100 and a bomber 1,000 where the centre gun hits it, twice as much where a side gun does; the end of a
+wave pays 500 for each building that stands, in one frame.
+"""

@@ -247,7 +247,10 @@ def recorded(tiny: Callable[..., Config]) -> Callable[..., Path]:
             point = {"throughput/frames": frames, "throughput/hours": hours, "learning/updates": updates}
             journal.metrics({**point, "score/mean_100": score, "actions/epsilon": 0.5}, int(frames) // 3)
         episodes = [
-            Episode(index, score, 12, index < truncated, bytearray([0, 1, 2, 3]), bytearray([0, 0, 0, 1]))
+            Episode(
+                *(index, score, 12, index < truncated, bytearray([0, 1, 2, 3]), bytearray([0, 0, 0, 1])),
+                points=[0.0, score / 4, 0.0, 0.0, score * 3 / 4],
+            )
             for index, score in enumerate(scores)
         ]
         evaluation = Evaluation(config.evaluation.epsilon, episodes)

@@ -11,6 +11,7 @@ import csv
 import hashlib
 import json
 import os
+import re
 import tarfile
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -28,6 +29,7 @@ from hydra import compose, initialize_config_dir
 from atlantis_exp.build import build_learner, build_plan
 from atlantis_exp.commands.composing import CONF, checked
 from atlantis_exp.config import Config
+from atlantis_exp.registry import SOURCES
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.training.fingerprint import history
 
@@ -287,6 +289,15 @@ def test_runs_of_an_earlier_version_compare_as_they_did(outputs: Path, command: 
             assert {key: row[key] for key in near} == near, name
             assert len(near) >= 2
     assert set(made) == {path.stem for path in (GOLDENS / "compare").iterdir()}
+    for row in rows_of((tables / "why.csv").read_text()):
+        mean, frames, rate, *split = (
+            float(row[key]) for key in ("mean", "frames_mean", "points_per_1000_frames", *SOURCES)
+        )
+        assert mean == pytest.approx(frames * rate / 1_000)
+        assert np.isnan(split).all()  # it recorded none, which is not zero
+    page = (tables.parent / "comparison.html").read_text()
+    assert "points per 1,000 frames" in page
+    assert "nan" not in re.sub(r"<[^>]*>", " ", page).split()
 
 
 def rows_of(text: str) -> list[dict[str, float | str]]:
@@ -308,8 +319,12 @@ def test_a_finished_run_of_an_earlier_version_plays_the_scores_that_it_recorded(
     protocol = ("episodes=3", "epsilon=0.5", "evaluation.seed=0", "evaluation.num_envs=1", "evaluation.video=false")
     assert command("evaluate", f"run={run.name}", *protocol, "tracking=none", f"paths.outputs={outputs}") == 0
     (table,) = outputs.glob("evaluations/*/artifacts/evaluation/episodes.csv")
-    assert table.read_text() == (run / "artifacts" / "evaluation" / "000000360.csv").read_text()
-    assert len({row["score"] for row in rows_of(table.read_text())}) > 1
+    played, recorded = (
+        rows_of(path.read_text()) for path in (table, run / "artifacts" / "evaluation" / "000000360.csv")
+    )
+    for row, before in zip(played, recorded, strict=True):
+        assert {key: row[key] for key in before} == before
+    assert len({row["score"] for row in played}) > 1
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from typing import Any
 from atlantis_exp.comparison.gather import AXES
 from atlantis_exp.comparison.published import Row, Table
 from atlantis_exp.comparison.report import COLUMNS, cells, number, shown_columns
+from atlantis_exp.registry import SOURCES
 
 _FRACTION = "fraction"
 """The unit of shares and probabilities, from 0 to 1; LaTeX has percent instead, as a person reads them."""
@@ -17,7 +18,7 @@ _POINTS = (
     *("iqm", "iqm_low", "iqm_high", "mean", "mean_low", "mean_high", "median", "median_low", "median_high"),
     *("low", "high", "lower_quartile", "upper_quartile", "standard_error", "score", "tau"),
     *("leader_score", "other_score", "difference", "difference_low", "difference_high"),
-    *("upper_score", "lower_score", "detectable", "delta", "score_low", "score_high"),
+    *("upper_score", "lower_score", "detectable", "delta", "score_low", "score_high", *SOURCES),
 )
 _FRACTIONS = (
     *("time_cap_share", "truncated_share", "random_share", "probability", "share", "network", "random"),
@@ -29,7 +30,9 @@ UNITS: Mapping[str, str] = {
     **dict.fromkeys(_FRACTIONS, _FRACTION),
     "score_per_1000_steps": "points",
     "points_per_frame": "points/frame",
+    "points_per_1000_frames": "points/1,000 frames",
     "frames": "frames",
+    "frames_mean": "frames",
     "steps": "steps",
     "steps_mean": "steps",
     "hours": "hours",
@@ -42,6 +45,7 @@ updates. A column that is not here counts something that its name says, or is no
 _UNITS_OF: Mapping[str, Mapping[str, str]] = {
     "improvement": {"low": _FRACTION, "high": _FRACTION},
     "profile": {"low": _FRACTION, "high": _FRACTION},
+    "why": dict.fromkeys(SOURCES, "points/1,000 frames"),
 }
 """Where a table's column has another unit than that of its name elsewhere."""
 

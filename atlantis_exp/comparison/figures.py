@@ -16,6 +16,7 @@ from atlantis_exp.comparison.gather import AXES
 from atlantis_exp.comparison.published import Table, random_line
 from atlantis_exp.comparison.tables import Comparison
 from atlantis_exp.media import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
+from atlantis_exp.registry import SOURCES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -77,6 +78,13 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
         "One dot a seed, the score as a diamond, with its 95 % interval from five seeds on; scores: "
         + _said([row["group"] for row in scores], scores, "score"),
         height=1.2 + 0.45 * len(scores),
+    )
+    drawn["why"] = _render(
+        partial(_why, comparison=comparison),
+        "Rate and survival",
+        "Points per 1,000 emulator frames, split by what paid them, and at each bar the mean frames of an episode; "
+        "rates: " + _said(groups, tables["why"], "points_per_1000_frames"),
+        height=1.6 + 0.6 * len(groups),
     )
     drawn["distribution"] = _render(
         partial(_distribution, comparison=comparison),
@@ -240,6 +248,27 @@ def _scores(axes: "Axes", comparison: Comparison) -> None:
     axes.set_yticks(range(len(table)), [row["group"] for row in table])
     axes.set_ylim(len(table) - 0.4, -0.8)
     axes.set_xlabel("score, one dot a seed")
+    _thousands(axes.xaxis)
+    _legend(axes)
+
+
+def _why(axes: "Axes", comparison: Comparison) -> None:
+    rows = comparison.tables["why"]
+    for y, row in enumerate(rows):
+        rate, left = row["points_per_1000_frames"], 0.0
+        for source, colour in zip(SOURCES, _COLOURS, strict=False):
+            label = source.replace("_", " ") if y == 0 else None
+            axes.barh(y, row[source], 0.6, left, color=colour, label=label)
+            left += row[source]
+        said = f"{row['frames_mean']:,.0f} frames"
+        if left != left:  # NaN: an older version recorded the episodes
+            axes.barh(y, rate, 0.6, color=_GREY)
+            said += ", split not recorded"
+        axes.annotate(said, (rate, y), (4, 0), textcoords="offset points", va="center", fontsize=8)
+    axes.set_xlim(0, 1.45 * max(row["points_per_1000_frames"] for row in rows) or 1)
+    axes.set_yticks(range(len(rows)), [row["group"] for row in rows])
+    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.set_xlabel("points per 1,000 frames")
     _thousands(axes.xaxis)
     _legend(axes)
 

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from atlantis_exp.checking import flatten, to_dict
 from atlantis_exp.comparison.gather import Training, select
 from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.registry import SOURCES
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.facts import read_facts
 from atlantis_exp.runs.folder import EVALUATION, RESULT, Result, RunFolder, all_runs
@@ -38,10 +39,10 @@ _RUN = ("run", "title", "kind", "group", "state", "error", "started", "updated")
 _EVALUATION = (
     *("run", "step", "source", "folder", "final", "epsilon", "evaluation_seed", "episodes"),
     *("mean", "standard_error", "median", "iqm", "lower_quartile", "upper_quartile", "low", "high"),
-    *("points_per_frame", "steps_mean", "truncated_share", "random_share"),
+    *("points_per_frame", "steps_mean", "truncated_share", "random_share", *SOURCES),
 )
 _PLACE = ("run", "step", "source", "folder")  # of an episode: the evaluation that it is of
-_EPISODE = ("episode", "seed", "score", "steps", "frames", "truncated", "random_share")
+_EPISODE = ("episode", "seed", "score", "steps", "frames", "truncated", "random_share", *SOURCES)
 
 
 @dataclass(frozen=True)
@@ -250,6 +251,7 @@ def _add_evaluation(
         "steps_mean": float(episodes.steps.mean()),
         "truncated_share": float(episodes.truncated.mean()),
         "random_share": float(random.sum() / episodes.steps.sum()),
+        **dict(zip(SOURCES, episodes.points.mean(axis=0).tolist(), strict=True)),
     }
     columns = {
         "episode": np.arange(summary.episodes),
@@ -259,6 +261,7 @@ def _add_evaluation(
         "frames": episodes.frames.astype(np.int64),
         "truncated": episodes.truncated.astype(np.bool_),
         "random_share": random / episodes.steps,
+        **dict(zip(SOURCES, episodes.points.T, strict=True)),
     }
     run.evaluations.append((row, columns))
 

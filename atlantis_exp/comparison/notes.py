@@ -160,6 +160,24 @@ def mixed(facts: Facts) -> Iterator[str]:
         yield f"The groups also differ in {_values(between)}."
 
 
+def survival_and_rate(facts: Facts) -> Iterator[str]:
+    """Which part of the difference between two means is survival, and which is rate."""
+    if len(facts.tables["why"]) != 2:
+        return
+    one, other = facts.tables["why"]
+    (frames, rate), (other_frames, other_rate) = (
+        (row["frames_mean"], row["points_per_1000_frames"]) for row in (one, other)
+    )
+    survival = (frames - other_frames) * (rate + other_rate) / 2 / 1_000
+    pace = (rate - other_rate) * (frames + other_frames) / 2 / 1_000
+    yield (
+        f"The mean of {one['group']} less that of {other['group']} is {one['mean'] - other['mean']:+,.0f} points: "
+        f"{survival:+,.0f} by survival ({frames:,.0f} against {other_frames:,.0f} frames an episode) and "
+        f"{pace:+,.0f} by rate ({rate:,.0f} against {other_rate:,.0f} points per 1,000 frames). This describes the "
+        f"episodes; nothing is decided by it."
+    )
+
+
 def missing_views(facts: Facts) -> Iterator[str]:
     """Views of the training that cannot be had."""
     shown = {row["view"] for row in facts.tables["views"]}
@@ -207,7 +225,14 @@ BESIDE: Sequence[Callable[[Facts], Iterator[str]]] = (
 )
 """What is said beside the verdict, since it can make it mean something else."""
 
-NOTES: Sequence[Callable[[Facts], Iterator[str]]] = (few_seeds, mixed, missing_views, capped, other_players)
+NOTES: Sequence[Callable[[Facts], Iterator[str]]] = (
+    few_seeds,
+    mixed,
+    survival_and_rate,
+    missing_views,
+    capped,
+    other_players,
+)
 """What is said after it."""
 
 

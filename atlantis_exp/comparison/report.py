@@ -8,6 +8,7 @@ from jinja2 import Environment, StrictUndefined
 from atlantis_exp.comparison.figures import Drawn
 from atlantis_exp.comparison.published import Row, Table
 from atlantis_exp.comparison.tables import Comparison
+from atlantis_exp.registry import SOURCES
 
 
 def page(comparison: Comparison, figures: Mapping[str, Drawn], facts: Mapping[str, str]) -> str:
@@ -49,6 +50,14 @@ COLUMNS = {
         "points_per_frame": "points per frame",
         "time_cap_share": "at time cap",
         "human_normalised_mean": "human-normalised",
+    },
+    "why": {
+        "group": "group",
+        "mean": "mean score",
+        "frames_mean": "frames an episode",
+        "time_cap_share": "at time cap",
+        "points_per_1000_frames": "points per 1,000 frames",
+        **{source: source.replace("_", " ") for source in SOURCES},
     },
     "modes": {
         "group": "group",

@@ -15,6 +15,7 @@ from atlantis_exp.comparison.published import Row, Table, literature
 from atlantis_exp.comparison.verdict import Answer, Question, answer, counted, families, group_of
 from atlantis_exp.comparison.words import said
 from atlantis_exp.decision import FEWEST_SEEDS, Look, Plan, Verdict, decide, mean_interval, modes
+from atlantis_exp.registry import SOURCES
 from atlantis_exp.statistics import Scores, human_normalised, probability_of_improvement, summarize
 
 Groups = Mapping[str, Sequence[Training]]
@@ -74,6 +75,7 @@ def compare(
         "plan": [_plan(each) for each in answers],
         "looks": [row for each in answers for row in _looks(each)],
         "evaluation": evaluation,
+        "why": [_why(label, runs) for label, runs in groups.items()],
         "modes": [row for row in evaluation for row in _modes(row, by_label[row["group"]])],
         "improvement": _improvement(groups),
         "views": _views(groups),
@@ -209,6 +211,27 @@ def _evaluation(label: str, runs: Sequence[Training]) -> Row:
         "points_per_frame": float(_pooled(runs).sum() / frames.sum()) if frames.sum() else _NAN,
         "time_cap_share": float(truncated.mean()),
         "human_normalised_mean": human_normalised(summary.mean),
+    }
+
+
+def _why(label: str, runs: Sequence[Training]) -> Row:
+    """A group's mean score as mean frames an episode times rate, and what the rate is made of.
+
+    The rate is in points per 1,000 emulator frames, and its parts sum to it; they are NaN where an episode's are.
+    """
+    tables = [training.episodes for training in counted(runs)[0]]
+    scores, frames, truncated, points = (
+        np.concatenate([getattr(table, name) for table in tables])
+        for name in ("scores", "frames", "truncated", "points")
+    )
+    thousands = frames.sum() / 1_000 or _NAN
+    return {
+        "group": label,
+        "mean": float(scores.mean()),
+        "frames_mean": float(frames.mean()),
+        "time_cap_share": float(truncated.mean()),
+        "points_per_1000_frames": float(scores.sum() / thousands),
+        **dict(zip(SOURCES, (points.sum(axis=0) / thousands).tolist(), strict=True)),
     }
 
 

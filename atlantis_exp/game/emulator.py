@@ -9,9 +9,12 @@ from ale_py import ALEInterface, ALEState, LoggerMode
 from ale_py.roms import get_rom_path
 
 from atlantis_exp.game.preprocessing import PALETTE, SCREEN_HEIGHT, SCREEN_WIDTH, Pixels, Preprocessing
+from atlantis_exp.registry import SOURCES
 
 ACTIONS = ("NOOP", "FIRE", "RIGHTFIRE", "LEFTFIRE")
 """ALE's minimal action set of Atlantis; an action is an index into it."""
+
+_WAVE_STATE, _WAVE_OVER = 0x53, 2  # a byte of the console's memory; so from the frame of the bonus to the next wave
 
 ALEInterface.setLoggerMode(LoggerMode.Error)  # of the whole process, and before the first emulator prints its banner
 
@@ -25,6 +28,7 @@ class Step(NamedTuple):
     truncated: bool
     life_lost: bool  # fewer buildings stand than before
     frames: int  # emulated in this step
+    points: list[float]  # the reward by its source, in the order of SOURCES
 
 
 class Emulator:
@@ -99,11 +103,12 @@ class Emulator:
         if not isinstance(frameskip, int):
             frameskip = int(self._generator.integers(*frameskip))
         frames_before, lives_before = self._ale.getFrameNumber(), self._lives
+        self._points = [0.0] * len(SOURCES)
         if self._max_pool:
             reward = self._act_and_pool(action, frameskip)
         else:
             # Also past the episode's end, where ALE emulates nothing but still draws for the sticky actions.
-            reward = sum(self._ale.act(self._actions[action]) for _ in range(frameskip))
+            reward = sum(self._act(action) for _ in range(frameskip))
         self._ale.getScreen(self._screen)
         observation = self.preprocessing.resize(self._pool) if self._max_pool else self.preprocessing(self._screen)
         self._steps += 1
@@ -117,6 +122,7 @@ class Emulator:
             truncated,
             self._lives < lives_before,
             self._ale.getFrameNumber() - frames_before,
+            self._points,
         )
 
     def state_dict(self) -> dict[str, Any]:
@@ -153,12 +159,27 @@ class Emulator:
         self._begun = False
         self._played = bytearray()  # actions since the origin
 
+    def _act(self, action: int) -> int:
+        """Plays one frame and returns its reward, which is added to the step's points by source."""
+        reward = self._ale.act(self._actions[action])
+        if reward:
+            points = self._points
+            if self._ale.getRAM()[_WAVE_STATE] == _WAVE_OVER:
+                points[4] += reward
+            else:  # of several hits in one frame the centre gun has one at most
+                bombers, vessels = divmod(reward // 100, 10)
+                points[0] += vessels % 2 * 100
+                points[1] += vessels // 2 * 200
+                points[2] += bombers % 2 * 1_000
+                points[3] += bombers // 2 * 2_000
+        return reward
+
     def _act_and_pool(self, action: int, frameskip: int) -> int:
         """Returns the reward; a step cut short pools with the step before, as in `AtariPreprocessing`."""
         reward = 0
         before_last = last = self._pool
         for left in reversed(range(frameskip)):
-            reward += self._ale.act(self._actions[action])
+            reward += self._act(action)
             if self._ale.game_over():
                 break
             if left <= 1:

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from atlantis_exp.faults import RunFault
 from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.preprocessing import Envs, Pixels
+from atlantis_exp.registry import SOURCES
 
 Rows = npt.NDArray[np.void]  # the last Step of each environment
 Calls = dict[int, tuple[Any, ...]]  # environment to the arguments of a call of its emulator
@@ -39,6 +40,7 @@ class Steps(NamedTuple):
     truncated: npt.NDArray[np.bool_]
     life_lost: npt.NDArray[np.bool_]
     frames: npt.NDArray[np.int64]
+    points: npt.NDArray[np.float64]  # (len(envs), sources), the rewards in the order of SOURCES
 
 
 class Emulators(ABC):
@@ -196,7 +198,7 @@ def make_emulators(make: Callable[[], Emulator], num_envs: int, workers: int) ->
 
 
 def _row(size: int) -> np.dtype[np.void]:
-    formats = [(np.uint8, (size, size)), np.float64, np.bool_, np.bool_, np.bool_, np.int64]
+    formats = [(np.uint8, (size, size)), np.float64, np.bool_, np.bool_, np.bool_, np.int64, (np.float64, len(SOURCES))]
     return np.dtype({"names": Steps._fields, "formats": formats}, align=True)
 
 

@@ -9,6 +9,8 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from atlantis_exp.registry import SOURCES
+
 Array = npt.NDArray[np.float64]
 
 
@@ -23,18 +25,19 @@ class EpisodeTable:
     frames: Array  # (episodes,)
     truncated: Array  # (episodes,), 1 where the time cap ended it
     counts: Array  # steps, (episodes, actions, 2): chosen by the network, by chance
+    points: Array  # (episodes, sources), scores in the order of SOURCES; NaN where an older version did not record them
 
     def to_csv(self) -> str:
-        """The table with a header; steps by action, and those of them that chance chose."""
+        """The table with a header; steps by action, those of them that chance chose, and points by source."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         by_chance = [f"{action}_random" for action in self.actions]
         head = ("episode", "seed", "score", "steps", "frames", "truncated", "random", *self.actions, *by_chance)
-        writer.writerow(head)
+        writer.writerow((*head, *SOURCES))
         for index, counts in enumerate(self.counts.astype(np.int64)):
             ends = (int(column[index]) for column in (self.steps, self.frames, self.truncated))
             row = (index, int(self.seeds[index]), float(self.scores[index]), *ends, int(counts[:, 1].sum()))
-            writer.writerow((*row, *counts.sum(1).tolist(), *counts[:, 1].tolist()))
+            writer.writerow((*row, *counts.sum(1).tolist(), *counts[:, 1].tolist(), *self.points[index].tolist()))
         return text.getvalue()
 
     @classmethod
@@ -53,4 +56,6 @@ class EpisodeTable:
             np.array([float(row[name]) for row in rows]) for name in ("score", "steps", "frames", "truncated")
         )
         seeds = np.array([int(row["seed"]) for row in rows])
-        return cls(actions, seeds, scores, steps, frames, truncated, np.stack((both - chance, chance), axis=2))
+        points = np.array([[float(row.get(source, "nan")) for source in SOURCES] for row in rows])
+        counts = np.stack((both - chance, chance), axis=2)
+        return cls(actions, seeds, scores, steps, frames, truncated, counts, points)

@@ -10,12 +10,10 @@ import numpy.typing as npt
 from atlantis_exp.game.emulator import ACTIONS
 from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.game.vector import Emulators
+from atlantis_exp.registry import SOURCES
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.statistics import Summary, summarize
 from atlantis_exp.training.actor import Actor
-
-GUNS = {"centre": (100.0, 1_000.0), "side": (200.0, 2_000.0)}
-"""What a step pays when a gun hits one vessel or one bomber; other sums are of several hits or of a wave's end."""
 
 _COLLAPSED = 0.99  # share of the network's decisions that are one action
 
@@ -35,7 +33,7 @@ class Episode:
     actions: bytearray = field(default_factory=bytearray)  # one a step
     random: bytearray = field(default_factory=bytearray)  # 1 where chance chose
     agrees: bytearray = field(default_factory=bytearray)  # 1 where that was the network's best action, if it was asked
-    guns: dict[str, float] = field(default_factory=lambda: dict.fromkeys(GUNS, 0.0))  # score that surely is a gun's
+    points: list[float] = field(default_factory=lambda: [0.0] * len(SOURCES))  # the score in the order of SOURCES
 
     @property
     def steps(self) -> int:
@@ -135,8 +133,8 @@ class Evaluation:
             "actions/favourite_share": self.favourite[1],
             **({} if agreement is None else {"actions/random_equals_best": agreement}),
             **{
-                f"evaluation/score_{gun}_gun": float(np.mean([episode.guns[gun] for episode in self.episodes]))
-                for gun in GUNS
+                f"evaluation/score_{source}": float(np.mean([episode.points[index] for episode in self.episodes]))
+                for index, source in enumerate(SOURCES)
             },
         }
 
@@ -152,6 +150,7 @@ class Evaluation:
             frames=values["frames"].astype(np.float64),
             truncated=values["truncated"].astype(np.float64),
             counts=np.array([episode.action_counts for episode in self.episodes], np.float64),
+            points=np.array([episode.points for episode in self.episodes], np.float64),
         )
 
     def report(self) -> str:
@@ -218,8 +217,10 @@ def evaluate(
                 episode.agrees.append(bool(decisions.agrees[row]))
             reward = float(steps.rewards[row])
             episode.score += reward
-            for gun, rewards in GUNS.items():
-                episode.guns[gun] += reward if reward in rewards else 0.0
+            if reward:
+                episode.points = [
+                    had + more for had, more in zip(episode.points, steps.points[row].tolist(), strict=True)
+                ]
             episode.frames += int(steps.frames[row])
             if steps.terminated[row] or steps.truncated[row]:
                 episode.truncated = bool(steps.truncated[row])

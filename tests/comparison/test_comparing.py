@@ -34,7 +34,7 @@ def test_a_comparison_is_a_page_figures_and_tables_in_a_folder_and_in_the_store(
     assert path.name == "comparison.html"
     assert path.is_relative_to(tmp_path / "comparisons")
     assert "resnet plays better than cnn" in path.read_text()
-    assert len(list((path.parent / "figures").glob("*.png"))) == 9
+    assert len(list((path.parent / "figures").glob("*.png"))) == 10
     with open(path.parent / "tables" / "runs.csv") as file:
         assert len(list(csv.DictReader(file))) == 10
 

@@ -18,6 +18,7 @@ from atlantis_exp.comparison.export_tables import UNITS
 from atlantis_exp.comparison.gather import gather
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
+from atlantis_exp.registry import SOURCES
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.statistics import summarize
 from atlantis_exp.training.evaluation import Episode, Evaluation
@@ -96,6 +97,7 @@ def test_an_evaluation_is_a_row_of_what_its_episodes_say(recorded: Recorded, tmp
     assert (row["low"], row["high"], row["standard_error"]) == (1_000, 9_000, summary.standard_error)
     assert row["points_per_frame"] == sum(scores) / (4 * 12)
     assert (row["steps_mean"], row["truncated_share"], row["random_share"]) == (4, 0.25, 0.25)
+    assert [row[source] for source in SOURCES] == [0, 3_750 / 4, 0, 0, 3_750 * 3 / 4]
 
 
 def test_an_episode_is_a_row_with_the_evaluation_that_it_is_of(recorded: Recorded, tmp_path: Path) -> None:
@@ -103,9 +105,11 @@ def test_an_episode_is_a_row_with_the_evaluation_that_it_is_of(recorded: Recorde
     loaded = load_runs(tmp_path)
     place = {"run": folder.name, "step": 160, "source": "training", "folder": f"runs/{folder.name}"}
     ends = {"steps": 4, "frames": 12, "random_share": 0.25}
+    unpaid = {"centre_vessel": 0.0, "centre_bomber": 0.0, "side_bomber": 0.0}
+    first, second = ({**unpaid, "side_vessel": score / 4, "wave_bonus": score * 3 / 4} for score in (300.0, 100.0))
     assert loaded.episodes.to_dict("records") == [
-        {**place, "episode": 0, "seed": 0, "score": 300.0, **ends, "truncated": True},
-        {**place, "episode": 1, "seed": 1, "score": 100.0, **ends, "truncated": False},
+        {**place, "episode": 0, "seed": 0, "score": 300.0, **ends, "truncated": True, **first},
+        {**place, "episode": 1, "seed": 1, "score": 100.0, **ends, "truncated": False, **second},
     ]
     assert loaded.episodes.dtypes[["step", "frames", "truncated"]].astype(str).tolist() == ["int64", "int64", "bool"]
 

@@ -75,7 +75,7 @@ def test_the_page_is_whole_fetches_nothing_and_is_made_for_phones_and_both_colou
     assert ("meta", {"name": "viewport", "content": "width=device-width, initial-scale=1"}) in tags.found
     assert "@media (prefers-color-scheme: dark)" in text
     pictures = [attributes for tag, attributes in tags.found if tag == "svg"]
-    assert len(pictures) == 9
+    assert len(pictures) == 10
     assert all(attributes["role"] == "img" and attributes["aria-label"] for attributes in pictures)
     ids = [attributes["id"] for _, attributes in tags.found if attributes.get("id")]
     referred = {(attributes.get("xlink:href") or "#")[1:] for tag, attributes in tags.found if tag == "use"}
@@ -126,7 +126,7 @@ def test_numbers_are_written_for_people(value: object, column: str, text: str) -
 def test_figures_are_pictures_of_something_and_take_on_the_pages_ink(figures: dict[str, Drawn]) -> None:
     assert list(figures) == [
         *("learning_frames", "exploration", "learning_hours", "learning_flops"),
-        *("scores", "distribution", "profile", "actions", "references"),
+        *("scores", "why", "distribution", "profile", "actions", "references"),
     ]
     for figure in figures.values():
         pixels = np.asarray(Image.open(io.BytesIO(figure.png)).convert("RGB"))
@@ -150,7 +150,7 @@ def test_a_comparison_without_curves_has_the_other_figures(recorded: Recorded, t
     recorded(curve=())
     gathered = gather(tmp_path)
     figures = draw(compare(gathered, group(gathered.trainings, ["model"]), Question(["model"])))
-    assert list(figures) == ["scores", "distribution", "profile", "actions", "references"]
+    assert list(figures) == ["scores", "why", "distribution", "profile", "actions", "references"]
 
 
 def test_comparing_loads_no_torch() -> None:

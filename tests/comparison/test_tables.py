@@ -2,17 +2,30 @@
 
 import csv
 import io
+import re
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.stats
 
+from atlantis_exp.comparison.figures import draw
 from atlantis_exp.comparison.gather import gather, group
 from atlantis_exp.comparison.published import early_dqn, literature
+from atlantis_exp.comparison.report import cells
 from atlantis_exp.comparison.tables import Comparison, compare, to_csv
 from atlantis_exp.comparison.verdict import Question
+from atlantis_exp.game.emulator import Emulator
+from atlantis_exp.game.preprocessing import Preprocessing
+from atlantis_exp.game.vector import make_emulators
+from atlantis_exp.registry import SOURCES
+from atlantis_exp.runs.episodes import EpisodeTable
+from atlantis_exp.runs.folder import evaluation_at
+from atlantis_exp.training.actor import RandomActor
+from atlantis_exp.training.evaluation import evaluate
 
 Recorded = Callable[..., Path]
 GOOD = (
@@ -47,6 +60,79 @@ def test_the_evaluation_of_a_group_is_that_of_all_its_episodes(compared: Callabl
     assert resnet["time_cap_share"] == 0
     assert resnet["human_normalised_mean"] == pytest.approx((pooled.mean() - 12_850) / (29_028.1 - 12_850))
     assert cnn["mean"] == np.mean(BAD)
+
+
+def played(actor: int, frames: int, seed: int) -> EpisodeTable:
+    """Two episodes of the game itself by a player that chooses among the first actions, cut at some frames."""
+    make = partial(
+        Emulator,
+        preprocessing=Preprocessing(32, (14, 160, 94, 0)),
+        frameskip=4,
+        sticky=0.25,
+        max_frames=frames,
+        max_steps=None,
+        noop_max=0,
+        max_pool=False,
+    )
+    with make_emulators(make, 2, workers=0) as emulators:
+        return evaluate(RandomActor(actor), emulators, episodes=2, epsilon=0.0, seed=seed, size=32, stack=4).table()
+
+
+def with_table(recorded: Recorded, table: EpisodeTable, *overrides: str) -> None:
+    """A recorded run whose evaluation is this one."""
+    (recorded(*overrides) / "artifacts" / evaluation_at(160)).write_text(table.to_csv())
+
+
+def test_the_score_is_survival_times_rate_and_the_rate_is_the_sum_of_what_paid(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    tables = {"cnn": [played(4, 1_200, 0), played(4, 1_200, 1)], "resnet": [played(2, 2_000, 0), played(2, 2_000, 1)]}
+    for model, seeds in tables.items():
+        for seed, table in enumerate(seeds):
+            with_table(recorded, table, f"model={model}", f"seed={seed}")
+    gathered = gather(tmp_path)
+    comparison = compare(gathered, group(gathered.trainings, ["model"]), Question(["model"]))
+    for row in comparison.tables["why"]:
+        episodes = tables[row["group"]]
+        scores, frames = (
+            [float(x) for table in episodes for x in getattr(table, name)] for name in ("scores", "frames")
+        )
+        assert row["mean"] == sum(scores) / 4
+        assert row["mean"] == pytest.approx(row["frames_mean"] * row["points_per_1000_frames"] / 1_000, rel=1e-12)
+        assert row["points_per_1000_frames"] == pytest.approx(1_000 * sum(scores) / sum(frames))
+        assert sum(row[source] for source in SOURCES) == pytest.approx(row["points_per_1000_frames"], rel=1e-12)
+        for index, source in enumerate(SOURCES):
+            points = sum(table.points[:, index].sum() for table in episodes)
+            assert row[source] == pytest.approx(1_000 * points / sum(frames))
+        assert row["time_cap_share"] == np.mean([table.truncated for table in episodes])
+    cnn, resnet = comparison.tables["why"]
+    assert cnn["side_vessel"] > 0 == resnet["side_vessel"]  # NOOP and FIRE are the first two actions
+    (note,) = (note for note in comparison.notes if "by survival" in note)
+    whole, survival, rate = (float(text.replace(",", "")) for text in re.findall(r"[+-][\d,]+", note))
+    assert note.startswith("The mean of cnn less that of resnet is ")
+    assert whole == pytest.approx(cnn["mean"] - resnet["mean"], abs=0.51)
+    assert survival + rate == pytest.approx(whole, abs=1.51)
+    middle = (cnn["points_per_1000_frames"] + resnet["points_per_1000_frames"]) / 2_000
+    assert survival == pytest.approx((cnn["frames_mean"] - resnet["frames_mean"]) * middle, abs=0.51)
+    assert survival < 0 < rate
+
+
+def test_a_split_that_one_episode_lacks_is_not_known_of_its_group_and_shown_as_empty(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    table = played(4, 400, 0)
+    with_table(recorded, table, "seed=0")
+    with_table(recorded, replace(table, points=np.full_like(table.points, np.nan)), "model=resnet")
+    gathered = gather(tmp_path)
+    comparison = compare(gathered, group(gathered.trainings, ["model"]), Question(["model"]))
+    cnn, resnet = comparison.tables["why"]
+    assert np.isfinite([cnn[source] for source in SOURCES]).all()
+    assert np.isnan([resnet[source] for source in SOURCES]).all()
+    assert resnet["points_per_1000_frames"] == cnn["points_per_1000_frames"] > 0
+    assert [text for text, _ in cells("why", resnet, comparison.tables["why"])][-5:] == [""] * 5
+    svg = draw(comparison)["why"].svg
+    assert svg.count("split not recorded") == 1
+    assert f"{table.frames.mean():,.0f} frames" in svg
 
 
 def test_the_score_of_a_group_is_the_mean_of_its_seeds_interquartile_means(compared: Callable[..., Comparison]) -> None:

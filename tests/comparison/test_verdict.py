@@ -53,7 +53,14 @@ def of(model: str, seed: int, scores: Sequence[float], sampler: str = "uniform",
     size = len(scores)
     frames = np.full(size, 100.0)
     table = EpisodeTable(
-        ("NOOP",), np.arange(size), np.array(scores), frames / 4, frames, np.zeros(size), np.ones((size, 1, 2))
+        ("NOOP",),
+        np.arange(size),
+        np.array(scores),
+        frames / 4,
+        frames,
+        np.zeros(size),
+        np.ones((size, 1, 2)),
+        np.full((size, 5), np.nan),
     )
     facts: dict[str, Any] = {"tags": {}, "policy": "", **changes}
     science = {key: value for key, value in config.items() if key != "budget.steps"}

@@ -1,7 +1,7 @@
 import json
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence, Set
 from typing import Any
 
 import gymnasium
@@ -14,6 +14,7 @@ from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 
 from atlantis_exp.game.emulator import ACTIONS, Emulator, Step, query_environment
 from atlantis_exp.game.preprocessing import FrameStack, Preprocessing
+from atlantis_exp.registry import SOURCES
 
 Pixels = npt.NDArray[np.uint8]
 
@@ -59,7 +60,7 @@ def play_beside_gymnasium(
             step = ours.step(action)
             theirs, reward, terminated, truncated, info = env.step(action)
             frames = info["frame_number"] - frames_before
-            assert step[1:] == (reward, terminated, truncated, info["lives"] < lives, frames)
+            assert step[1:6] == (reward, terminated, truncated, info["lives"] < lives, frames)
             assert ours.lives == info["lives"]
             lives = info["lives"]
             assert np.array_equal(view(step.observation), theirs)
@@ -130,6 +131,40 @@ def test_a_held_button_scores_two_thousand_points() -> None:
             score += step.reward
             step = ours.step(action)
         assert score + step.reward == 2_000
+
+
+@pytest.mark.parametrize(
+    ("actions", "never", "seed", "bonuses"),
+    [
+        ((0,), {"centre_vessel", "side_vessel", "centre_bomber", "side_bomber"}, 0, {500, 1_500}),
+        ((0, 1), {"side_vessel", "side_bomber"}, 6, {1_000, 2_000}),  # FIRE alone
+        ((0, 2, 3), {"centre_vessel", "centre_bomber"}, 2, {1_000, 2_000}),
+    ],
+)
+def test_no_points_are_of_a_gun_that_never_fires_and_a_bonus_is_500_a_building(
+    actions: Sequence[int], never: Set[str], seed: int, bonuses: Set[float]
+) -> None:
+    """So what two or four buildings pay is told from what a bomber pays, which is the same."""
+    ours, rng = emulator(), np.random.default_rng(seed)
+    ours.reset(seed)
+    totals, paid, step = dict.fromkeys(SOURCES, 0.0), set(), None
+    while step is None or not step.terminated:
+        step = ours.step(int(rng.choice(actions)))
+        points = dict(zip(SOURCES, step.points, strict=True))
+        assert sum(points.values()) == step.reward
+        if bonus := points["wave_bonus"]:
+            assert bonus == step.reward == 500 * (ours.lives + 1)  # ALE does not count the last building
+            paid.add(bonus)
+        totals = {source: total + points[source] for source, total in totals.items()}
+    assert {source for source, total in totals.items() if not total} == never
+    assert paid >= bonuses
+
+
+def test_two_hits_in_one_frame_are_two() -> None:
+    ours, rng = emulator(), np.random.default_rng(47)
+    ours.reset(seed=47)
+    *_, step = (ours.step(int(rng.integers(4))) for _ in range(821))
+    assert step.points == [0, 400, 0, 0, 0]
 
 
 def test_actions_are_the_minimal_set_of_ale() -> None:

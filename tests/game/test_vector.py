@@ -78,7 +78,7 @@ def test_each_environment_is_its_own_emulator() -> None:
             for env, emulator in enumerate(alone):
                 step = emulator.step(1 + env)
                 np.testing.assert_array_equal(steps.observations[env], step.observation)
-                assert tuple(column[env] for column in steps[1:]) == step[1:]
+                assert tuple(column[env].tolist() for column in steps[1:]) == step[1:]
 
 
 @pytest.fixture(scope="module")
@@ -251,11 +251,11 @@ def test_a_parent_that_forgets_to_close_ends_in_silence() -> None:
     await_end([int(pid) for pid in told.stdout.split()])
 
 
-def test_workers_import_nothing_but_this_wing_and_what_a_fault_is() -> None:
+def test_workers_import_nothing_but_this_wing_what_a_fault_is_and_what_pays_points() -> None:
     code = "import sys, atlantis_exp.game.vector; print(*sys.modules)"
     modules = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True).stdout.split()
     ours = {name for name in modules if name.startswith("atlantis_exp.")}
-    assert ours == {"atlantis_exp.game", "atlantis_exp.faults"} | {
+    assert ours == {"atlantis_exp.game", "atlantis_exp.faults", "atlantis_exp.registry"} | {
         f"atlantis_exp.game.{room}" for room in ("preprocessing", "emulator", "vector")
     }
     assert not {"torch", "mlflow", "hydra", "omegaconf", "matplotlib"} & set(modules)

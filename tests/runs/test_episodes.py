@@ -1,6 +1,6 @@
 """The table of evaluated episodes: what is written is what is read."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -14,15 +14,17 @@ from atlantis_exp.training.evaluation import Episode, Evaluation
 
 GOLDEN = """\
 episode,seed,score,steps,frames,truncated,random,NOOP,FIRE,RIGHTFIRE,LEFTFIRE,\
-NOOP_random,FIRE_random,RIGHTFIRE_random,LEFTFIRE_random
-0,1,300.0,4,12,0,1,1,2,0,1,1,0,0,0
-1,4294967295,900.0,2,6,1,1,0,0,0,2,0,0,0,1
+NOOP_random,FIRE_random,RIGHTFIRE_random,LEFTFIRE_random,\
+centre_vessel,side_vessel,centre_bomber,side_bomber,wave_bonus
+0,1,300.0,4,12,0,1,1,2,0,1,1,0,0,0,100.0,200.0,0.0,0.0,0.0
+1,4294967295,900.0,2,6,1,1,0,0,0,2,0,0,0,1,0.0,400.0,0.0,0.0,500.0
 """
+WITHOUT_POINTS = "".join(f"{line.rsplit(',', 5)[0]}\n" for line in GOLDEN.splitlines())  # as stored by older versions
 EVALUATION = Evaluation(
     0.1,
     [
-        Episode(1, 300.0, 12, False, bytearray([0, 1, 1, 3]), bytearray([1, 0, 0, 0])),
-        Episode(2**32 - 1, 900.0, 6, True, bytearray([3, 3]), bytearray([1, 0])),
+        Episode(1, 300.0, 12, False, bytearray([0, 1, 1, 3]), bytearray([1, 0, 0, 0]), points=[100, 200, 0, 0, 0]),
+        Episode(2**32 - 1, 900.0, 6, True, bytearray([3, 3]), bytearray([1, 0]), points=[0, 400, 0, 0, 500]),
     ],
 )
 
@@ -32,6 +34,7 @@ episodes = st.tuples(
     st.integers(0, 10**6),  # frames
     st.booleans(),  # truncated
     st.lists(st.tuples(st.integers(0, 10**5), st.integers(0, 10**5)), min_size=4, max_size=4),  # steps by action
+    st.lists(st.floats(0, 1e9) | st.just(float("nan")), min_size=5, max_size=5),  # points by source
 )
 
 
@@ -40,7 +43,7 @@ def assert_equal(one: EpisodeTable, other: EpisodeTable) -> None:
     for name in (field.name for field in fields(EpisodeTable) if field.name != "actions"):
         ours, theirs = getattr(one, name), getattr(other, name)
         assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape), name
-        assert np.array_equal(ours, theirs), name
+        assert np.array_equal(ours, theirs, equal_nan=True), name
 
 
 def test_the_table_of_an_evaluation_is_the_text_that_stored_runs_have() -> None:
@@ -57,8 +60,20 @@ def test_a_stored_table_is_read(tmp_path: Path) -> None:
     assert table.counts.tolist() == [[[0, 1], [2, 0], [0, 0], [1, 0]], [[0, 0], [0, 0], [0, 0], [1, 1]]]
 
 
+def test_a_table_stored_without_points_is_read_and_their_split_is_not_known(tmp_path: Path) -> None:
+    (tmp_path / "episodes.csv").write_text(WITHOUT_POINTS)
+    table = EpisodeTable.read(tmp_path / "episodes.csv")
+    assert table.points.shape == (2, 5)
+    assert np.isnan(table.points).all()
+    assert_equal(replace(table, points=EVALUATION.table().points), EVALUATION.table())
+    (tmp_path / "episodes.csv").write_text(table.to_csv())
+    assert_equal(EpisodeTable.read(tmp_path / "episodes.csv"), table)
+
+
 @given(st.lists(episodes, min_size=1, max_size=5))
-def test_writing_and_reading_are_inverse(rows: list[tuple[int, float, int, bool, list[tuple[int, int]]]]) -> None:
+def test_writing_and_reading_are_inverse(
+    rows: list[tuple[int, float, int, bool, list[tuple[int, int]], list[float]]],
+) -> None:
     counts = np.array([row[4] for row in rows], np.float64)
     table = EpisodeTable(
         actions=("NOOP", "FIRE", "RIGHTFIRE", "LEFTFIRE"),
@@ -68,6 +83,7 @@ def test_writing_and_reading_are_inverse(rows: list[tuple[int, float, int, bool,
         frames=np.array([row[2] for row in rows], np.float64),
         truncated=np.array([row[3] for row in rows], np.float64),
         counts=counts,
+        points=np.array([row[5] for row in rows], np.float64),
     )
     with TemporaryDirectory() as folder:
         path = Path(folder, "episodes.csv")

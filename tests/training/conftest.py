@@ -57,7 +57,8 @@ class Game:
     def step(self, action: int) -> Step:
         self.played += 1
         reward = 100.0 * self.generator.integers(3) * (action > 0)
-        return Step(self.screen(), reward, False, self.played == self.steps, False, int(self.generator.integers(2, 5)))
+        screen, frames = self.screen(), int(self.generator.integers(2, 5))
+        return Step(screen, reward, False, self.played == self.steps, False, frames, [0.0, reward, 0.0, 0.0, 0.0])
 
     def screen(self) -> npt.NDArray[np.uint8]:
         return self.generator.integers(256, size=(SIZE, SIZE), dtype=np.uint8)

@@ -9,6 +9,7 @@ import pytest
 from atlantis_exp.build import build_learner, make_emulator
 from atlantis_exp.config import Config
 from atlantis_exp.game.vector import make_emulators
+from atlantis_exp.registry import SOURCES
 from atlantis_exp.training.actor import Actor, EpsilonGreedy, RandomActor
 from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate
 
@@ -115,19 +116,21 @@ def test_a_player_without_a_network_has_no_favourite(played: Callable[..., Evalu
     assert not evaluation.collapsed
 
 
-def test_the_score_is_told_apart_by_gun_where_a_step_s_reward_is_one_hit_s(tiny: Compose) -> None:
+def test_the_score_is_split_by_what_paid_it(tiny: Compose) -> None:
     env = tiny("env.max_steps=700").env
     with make_emulators(make_emulator(env), 2, workers=0) as emulators:
         evaluation = evaluate(
             RandomActor(4), emulators, episodes=2, epsilon=0.0, seed=5, size=env.size, stack=env.stack
         )
-    emulator, totals = make_emulator(env)(), {"centre": 0.0, "side": 0.0}
+    emulator = make_emulator(env)()
+    totals = dict.fromkeys(SOURCES, 0.0)
     for episode in evaluation.episodes:
+        assert sum(episode.points) == episode.score > 0
         emulator.reset(episode.seed)
-        rewards = [emulator.step(action).reward for action in episode.actions]
-        totals["centre"] += sum(reward for reward in rewards if reward in (100, 1_000))
-        totals["side"] += sum(reward for reward in rewards if reward in (200, 2_000))
-    assert min(totals.values()) > 0
+        for action in episode.actions:
+            for source, points in zip(SOURCES, emulator.step(action).points, strict=True):
+                totals[source] += points
+    assert min(totals["centre_vessel"], totals["side_vessel"], totals["wave_bonus"]) > 0
     metrics = evaluation.metrics()
-    for gun, total in totals.items():
-        assert metrics[f"evaluation/score_{gun}_gun"] == total / 2
+    assert {source: 2 * metrics[f"evaluation/score_{source}"] for source in SOURCES} == totals
+    assert evaluation.table().points.tolist() == [episode.points for episode in evaluation.episodes]
