@@ -137,16 +137,21 @@ def choose_precision(name: str, device: torch.device) -> str:
 
 def build_network(config: cfg.Config, name: str) -> nn.Module:
     """A network with weights from the named stream; the global generator is as it was."""
+    initial, dropout = stream(config.seed, name).generate_state(2, np.uint64)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(initial >> np.uint64(1)))
+        network = _architecture(config)
+    seed_dropout(network, int(dropout >> np.uint64(1)))
+    return network
+
+
+def _architecture(config: cfg.Config) -> nn.Module:
+    """A network with weights from the global generator."""
     env, objective = config.env, config.objective
     head: Head = DuelingHead if config.model.head == "dueling" else nn.Linear
     if isinstance(objective, cfg.QuantileConfig):
         head = partial(QuantileHead, quantiles=objective.quantiles)
-    initial, dropout = stream(config.seed, name).generate_state(2, np.uint64)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(initial >> np.uint64(1)))
-        network = NETWORKS[type(config.model)]((env.stack, env.size, env.size), len(ACTIONS), head)
-    seed_dropout(network, int(dropout >> np.uint64(1)))
-    return network
+    return NETWORKS[type(config.model)]((env.stack, env.size, env.size), len(ACTIONS), head)
 
 
 def build_optimizer(optimizer: cfg.AdamConfig | cfg.RmsPropConfig, network: nn.Module) -> torch.optim.Optimizer:
@@ -232,8 +237,11 @@ def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Acto
         Fault: where the weights are damaged or another network's.
     """
     try:
+        tensors = safetensors.torch.load(weights)
+        with torch.device("meta"):  # shapes first: a card may claim a network that no memory holds
+            _architecture(config).load_state_dict(tensors, assign=True)
         learner = build_learner(dataclasses.replace(config, device=device, compile=False))
-        learner.load_state_dict({**learner.state_dict(), "network": safetensors.torch.load(weights)})
+        learner.load_state_dict({**learner.state_dict(), "network": tensors})
     except (SafetensorError, RuntimeError) as error:
         raise Fault(f"the weights are damaged or another network's: {' '.join(str(error).split())}") from error
     return EpsilonGreedy(learner.q_values, len(ACTIONS), watches=True)

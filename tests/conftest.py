@@ -199,7 +199,7 @@ def tiny(tmp_path: Path) -> Callable[..., Config]:
     return composed
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def tiny_overrides() -> tuple[str, ...]:
     """What `tiny` composes with, for a process of its own."""
     return TINY

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -78,6 +78,15 @@ class Player:
     episodes: EpisodeTable
 
 
+class _Later(NamedTuple):
+    """An evaluation that the verb `evaluate` made of a training."""
+
+    made: int  # ms since 1970
+    step: int
+    epsilon: float
+    folder: RunFolder
+
+
 @dataclass
 class Gathered:
     """What the outputs folder holds, and what of it was left aside: a folder's name to the reason."""
@@ -98,8 +107,8 @@ def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None
     the verb `evaluate` made; given `epsilon`, of the latest at that epsilon. What resume=never put aside is left out
     unless it is asked for, as it is where commits are compared: it is what an earlier one made of the same recipe.
     """
-    evaluations = _evaluations(outputs)
     gathered = Gathered()
+    evaluations = _evaluations(outputs, gathered.skipped)
     for folder in [RunFolder(path) for path in sorted((outputs / "runs").glob("*")) if path.is_dir()]:
         if runs and not any(fnmatchcase(folder.name, f"{pattern}*") for pattern in runs):
             continue
@@ -110,7 +119,7 @@ def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None
                     Player(folder.name, flatten(tree), EpisodeTable.read(folder.artifact(EVALUATION)))
                 )
                 continue
-            gathered.trainings.append(_training(folder, parse(Config, tree), evaluations[folder.name], epsilon))
+            gathered.trainings.append(_training(folder, parse(Config, tree), evaluations.get(folder.name, []), epsilon))
         except _Unusable as error:
             gathered.skipped[folder.name] = str(error)
         except (Fault, ValueError, KeyError, TypeError, OSError) as error:
@@ -220,7 +229,7 @@ def _config(folder: RunFolder, put_aside: bool) -> dict[str, Any]:
 def _training(
     folder: RunFolder,
     config: Config,
-    evaluations: Sequence[tuple[int, dict[str, Any], RunFolder]],
+    evaluations: Sequence[_Later],
     epsilon: float | None,
 ) -> Training:
     points = np.array([[record.values[key] for key in _CURVE.values()] for record in curve(folder.path, _POINT)])
@@ -233,9 +242,7 @@ def _training(
     steps = folder.result.steps
     tables = [(config.evaluation.epsilon, folder, folder.artifact(evaluation_at(steps)))]
     tables += [
-        (facts["evaluation"]["epsilon"], run, run.artifact(EVALUATION))
-        for _, facts, run in sorted(evaluations, key=lambda evaluation: evaluation[0])
-        if facts["step"] == steps
+        (later.epsilon, later.folder, later.folder.artifact(EVALUATION)) for later in evaluations if later.step == steps
     ]
     tables = [table for table in tables if table[2].exists() and epsilon in (None, table[0])]
     if not tables:
@@ -252,15 +259,16 @@ def _training(
     return Training(folder.name, leaves, flatten(science), arrays, episodes, tags, policy)
 
 
-def _evaluations(outputs: Path) -> dict[str, list[tuple[int, dict[str, Any], RunFolder]]]:
-    """The finished runs of the verb `evaluate` by the run that they evaluate: when, with which facts, where."""
-    found: dict[str, list[tuple[int, dict[str, Any], RunFolder]]] = defaultdict(list)
+def _evaluations(outputs: Path, skipped: dict[str, str]) -> dict[str, list[_Later]]:
+    """The finished runs of the verb `evaluate` by the run that they evaluate, in the order they were made."""
+    found: dict[str, list[_Later]] = defaultdict(list)
     for path in sorted((outputs / "evaluations").glob(f"*/{RESULT}")):
         folder = RunFolder(path.parent)
         try:
             facts, commit = folder.config, folder.commit
-            if commit is not None:
-                found[facts["run"]].append((commit.updated, facts, folder))
-        except (Fault, ValueError, KeyError, TypeError, OSError):
-            continue  # what it evaluates cannot be told
-    return found
+            if commit is not None and "run" in facts:  # of exported weights there is none
+                epsilon = float(facts["evaluation"]["epsilon"])
+                found[str(facts["run"])].append(_Later(commit.updated, int(facts["step"]), epsilon, folder))
+        except (Fault, ValueError, KeyError, TypeError, OSError) as error:
+            skipped[f"evaluations/{folder.name}"] = f"broken: {type(error).__name__}: {error}"
+    return {run: sorted(later, key=lambda each: each.made) for run, later in found.items()}

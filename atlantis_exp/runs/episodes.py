@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -10,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atlantis_exp.registry import SOURCES
+from atlantis_exp.runs.files import TABLE, read_file
 
 Array = npt.NDArray[np.float64]
 
@@ -43,13 +45,20 @@ class EpisodeTable:
     @classmethod
     def read(cls, path: Path) -> Self:
         """The table in a file. Raises: ValueError, OSError."""
-        with open(path, newline="") as file:
-            rows = list(csv.DictReader(file))
+        try:
+            header, *lines = csv.reader(io.StringIO(read_file(path, TABLE).decode(), newline=""), strict=True)
+            rows = [dict(zip(header, line, strict=True)) for line in lines]
+            return cls._of(rows)
+        except (ValueError, KeyError, csv.Error) as error:
+            raise ValueError(f"{path} is no table of episodes: {error}") from None
+
+    @classmethod
+    def _of(cls, rows: Sequence[Mapping[str, str]]) -> Self:
         if not rows:
-            raise ValueError(f"{path} has no episode")
+            raise ValueError("it has none")
         actions = tuple(name.removesuffix("_random") for name in rows[0] if name.endswith("_random"))
         if not actions:
-            raise ValueError(f"{path} does not say who chose the actions: play it again")
+            raise ValueError("it does not say who chose the actions: play it again")
         chance = np.array([[float(row[f"{action}_random"]) for action in actions] for row in rows])
         both = np.array([[float(row[action]) for action in actions] for row in rows])
         scores, steps, frames, truncated = (

@@ -26,10 +26,9 @@ def open_file(path: Path) -> BinaryIO:
 def read_file(path: Path, most: int) -> bytes:
     """The content of a regular file of at most so many bytes. Raises: OSError, ValueError."""
     with open_file(path) as file:
-        content = file.read(most + 1)
-    if len(content) > most:
-        raise ValueError(f"{path} has more than {most:,} bytes")
-    return content
+        if (size := os.fstat(file.fileno()).st_size) > most:
+            raise ValueError(f"{path} has {size:,} bytes, more than {most:,}")
+        return file.read()
 
 
 def read_object(content: bytes) -> dict[str, Any]:

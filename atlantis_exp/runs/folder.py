@@ -15,6 +15,7 @@ from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs import lock
 from atlantis_exp.runs.files import SMALL, read_file, write_file
 from atlantis_exp.runs.journal import Commit, Status, read_commit
+from atlantis_exp.statistics import TABLE_COLUMNS
 
 CONFIG, RESULT, COMMIT = "config.json", "result.json", "commit.json"
 TRACEBACK = "traceback.txt"
@@ -31,6 +32,7 @@ NETWORK = "network"
 """The name of the models that are a training's networks."""
 EVALUATION, EVALUATION_REPORT = "evaluation/episodes.csv", "evaluation/report.txt"  # of a run that is one evaluation
 
+_EVALUATED = {*(f"evaluation/{point}" for point in (*TABLE_COLUMNS, "episodes")), "actions/random_share"}
 _HOLD_SECONDS = 2.0  # that a command waits for a run, which another may hold for a moment
 
 State = Literal["done", "running", "failed", "interrupted", "missing"]
@@ -49,8 +51,12 @@ class Result:
     outcome: str
     steps: int
     counts: dict[str, float]  # episodes, frames, updates and hours of a training
-    evaluation: dict[str, float]
+    evaluation: dict[str, float]  # empty where there was none
     report: str
+
+    def __post_init__(self) -> None:
+        if self.evaluation and (missing := _EVALUATED - self.evaluation.keys()):
+            raise ValueError(f"its evaluation lacks {min(missing)}")
 
 
 @dataclass(frozen=True)

@@ -96,8 +96,8 @@ def test_writing_and_reading_are_inverse(
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("", "has no episode"),
-        (GOLDEN.splitlines()[0], "has no episode"),
+        ("", "is no table of episodes"),
+        (GOLDEN.splitlines()[0], "is no table of episodes"),
         ("episode,seed,score,steps,frames,truncated\n0,1,300.0,4,12,0\n", "does not say who chose the actions"),
         (GOLDEN.replace("300.0", "many"), "could not convert"),
     ],
