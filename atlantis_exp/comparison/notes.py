@@ -9,6 +9,7 @@ from atlantis_exp.comparison.gather import AXES, COMMIT, Training, resolve
 from atlantis_exp.comparison.published import Table, early_dqn, random_line
 from atlantis_exp.comparison.verdict import Answer, counted
 from atlantis_exp.decision import FEWEST_SEEDS, equal_scores
+from atlantis_exp.runs.folder import LOST
 from atlantis_exp.statistics import EARLY_FRAMES
 
 _NAMED = 6  # runs, up to which a line names them
@@ -79,6 +80,12 @@ def different_makers(facts: Facts) -> Iterator[str]:
         if len(holders) > 1:
             named = "; ".join(f"{value}: {_listed(names)}" for value, names in sorted(holders.items()))
             yield f"The runs were made in different {called}: {named}."
+
+
+def lossy(facts: Facts) -> Iterator[str]:
+    """Runs that went on without a part of their replay memory."""
+    if names := [run.name for run in facts.trainings if LOST in run.tags]:
+        yield f"Went on without a part of their replay memory, which was damaged: {_listed(names)}."
 
 
 def uncommitted(facts: Facts) -> Iterator[str]:
@@ -217,6 +224,7 @@ BESIDE: Sequence[Callable[[Facts], Iterator[str]]] = (
         equal_across,
         modes_found,
         different_makers,
+        lossy,
         uncommitted,
         unbalanced,
         later_seeds,

@@ -233,6 +233,23 @@ class ReplayMemory:
             )
         self.check_valid()
 
+    def load_newest(self, segments: Iterable[dict[str, Any]], next_id: int) -> None:
+        """Become the memory that wrote `segments`, without the observations of those before them.
+
+        Of no segment, an empty memory that goes on at `next_id`; its environments have no episode under way.
+
+        Raises:
+            ValueError: as `load_segments`, but for missing ones.
+        """
+        self._clear(next_id, b"")
+        for segment in segments:
+            self._load_segment(segment)
+        self.check_valid()
+
+    def is_under_way(self, env: int) -> bool:
+        """Tell whether an environment has an episode that steps can be added to."""
+        return env in self._newest
+
     def state_dict(self) -> dict[str, Any]:
         """Return everything in one segment."""
         return self.segment(0)

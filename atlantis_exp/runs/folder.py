@@ -33,6 +33,8 @@ NETWORK = "network"
 EVALUATION, EVALUATION_REPORT = "evaluation/episodes.csv", "evaluation/report.txt"  # of a run that is one evaluation
 
 _EVALUATED = {*(f"evaluation/{point}" for point in (*TABLE_COLUMNS, "episodes")), "actions/random_share"}
+LOST = "lost"
+"""The tag of a run that went on without a part of its replay memory: it is not the unbroken one bit for bit."""
 _HOLD_SECONDS = 2.0  # that a command waits for a run, which another may hold for a moment
 
 State = Literal["done", "running", "failed", "interrupted", "missing"]

@@ -19,7 +19,7 @@ from uuid import uuid4
 
 from pydantic import TypeAdapter, ValidationError
 
-from atlantis_exp.faults import RunFault
+from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import SMALL, open_file, read_file, read_object, write_file
 
 Status = Literal["SCHEDULED", "RUNNING", "FINISHED", "FAILED", "KILLED"]
@@ -108,7 +108,7 @@ class Commit:
     parent: str = ""
 
 
-class JournalError(RunFault, ValueError):
+class JournalError(Fault, ValueError):
     """A journal that cannot be continued from."""
 
 
@@ -267,7 +267,10 @@ class Journal:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         path = self._folder / "journal.jsonl"
         if path.stat().st_size < state["offset"]:
-            raise JournalError(f"{path} is shorter than the checkpoint says: it was cut or replaced since")
+            raise JournalError(
+                f"{path} is shorter than the checkpoint says: it was cut or replaced since; "
+                "restore it, or begin anew with resume=never, which keeps what is there"
+            )
         self._offset, self._time = state["offset"], state["time"]
         self._lines.clear()
 

@@ -13,7 +13,7 @@ from atlantis_exp.build import build_trainer
 from atlantis_exp.checking import flatten, to_dict
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault, RunFault
-from atlantis_exp.runs.folder import CONFIG, TRACEBACK, Result, RunFolder
+from atlantis_exp.runs.folder import CONFIG, LOST, TRACEBACK, Result, RunFolder
 from atlantis_exp.runs.journal import Journal, adopt
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.job import Job, labels
@@ -105,6 +105,8 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
         journal.tags({"flops_per_update": str(flops)})
     else:
         trainer.load_state_dict(state)
+    if lost := trainer.checkpoints.lost:
+        journal.tags({LOST: f"{lost:,} observations of the replay memory, at step {steps_done:,}"})
     facts = {
         "device": str(trainer.learner.device),
         "precision": str(trainer.learner.dtype).removeprefix("torch."),

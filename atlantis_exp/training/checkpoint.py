@@ -4,6 +4,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import safetensors.torch
 import torch
 from safetensors import SafetensorError
 
-from atlantis_exp.faults import RunFault
+from atlantis_exp.faults import Fault
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.runs.files import CHECKPOINT, SMALL, read_file, read_object, write_file
 
@@ -21,7 +22,7 @@ FORMAT = 1
 _SEGMENTS = 64  # of a full memory, about
 
 
-class CheckpointError(RunFault):
+class CheckpointError(Fault):
     """No checkpoint that could be continued from, although there is one; says which and why."""
 
 
@@ -40,6 +41,7 @@ class Checkpoints:
         self.identity = identity
         self._segments: list[dict[str, Any]] = []  # of the memory, oldest first: name, since, next_id, sha256
         self._generation = 0
+        self.lost = 0  # observations that the memory which was loaded should have, at most
 
     def save(self, state: Mapping[str, Any], memory: ReplayMemory) -> None:
         """Write a generation. Raises: OSError, with the generations before it intact."""
@@ -70,12 +72,28 @@ class Checkpoints:
     ) -> dict[str, Any] | None:
         """The newest whole generation's state; None where nothing was ever saved. Restores `memory` if there is one.
 
-        A damaged generation is passed over with a call of `warn`, which gets one line.
+        A damaged generation is passed over with a call of `warn`, which gets one line. Where none has its whole memory,
+        since generations share segments, the newest goes on with the observations behind the last damaged segment;
+        `lost` says how many that costs.
 
         Raises:
             CheckpointError: if all generations are damaged, or the newest is of another experiment or a newer format.
         """
-        faults = []
+        faults: list[str] = []
+        state = self._load(memory, False, faults)
+        for fault in faults:
+            warn(fault)
+        if state is not None or not faults:
+            return state
+        if memory is not None and (state := self._load(memory, True, [])) is not None:
+            warn(f"no checkpoint has its whole replay memory: {self.lost:,} observations are lost, the run goes on")
+            return state
+        raise CheckpointError(
+            f"{faults[0]}, and no older one is whole; resume=never keeps what is there and begins anew"
+        )
+
+    def _load(self, memory: ReplayMemory | None, may_lose: bool, faults: list[str]) -> dict[str, Any] | None:
+        """The newest generation's state that can be read, with the faults of those that cannot."""
         for generation in sorted(self._generations(), reverse=True):
             try:
                 manifest = read_object(read_file(self.folder / _name(generation) / "manifest.json", SMALL))
@@ -84,17 +102,31 @@ class Checkpoints:
                 self._refuse_foreign(manifest, generation)
                 state = self._read(_name(generation), manifest["state"])
                 segments = manifest["segments"]
-                if memory is not None:
+                if memory is not None and not may_lose:
                     memory.load_segments(self._read(entry["name"], entry["sha256"]) for entry in segments)
+                elif memory is not None:
+                    segments = self._load_what_is_left(memory, segments)
             except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
                 faults.append(f"checkpoint {generation} in {self.folder} is damaged ({error})")
-                warn(faults[-1])
                 continue
             self._segments, self._generation = segments, generation
             return state
-        if faults:
-            raise CheckpointError(f"{faults[0]}, and no older one is whole")
         return None
+
+    def _load_what_is_left(self, memory: ReplayMemory, segments: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Restore the segments behind the last damaged one, and return them."""
+        whole: list[dict[str, Any]] = []
+        contents: list[dict[str, Any]] = []
+        with suppress(OSError, ValueError, KeyError, TypeError, SafetensorError):
+            for entry in reversed(segments):
+                contents.insert(0, self._read(entry["name"], entry["sha256"]))
+                whole.insert(0, entry)
+        if not segments:
+            raise ValueError("it has no segment of the replay memory")
+        oldest_id, next_id = int(segments[0]["since"]), int(segments[-1]["next_id"])
+        memory.load_newest(contents, next_id)
+        self.lost = memory.oldest_id - max(oldest_id, next_id - memory.capacity)
+        return whole
 
     def _refuse_foreign(self, manifest: Mapping[str, Any], generation: int) -> None:
         if manifest["format"] > FORMAT:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import safetensors.torch
 
-from atlantis_exp.faults import RunFault
+from atlantis_exp.faults import Fault
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.media import score_heatmap, score_histogram
 from atlantis_exp.replay.memory import ReplayMemory
@@ -38,7 +38,7 @@ class Played(NamedTuple):
     env: int
 
 
-class Diverged(RunFault):
+class Diverged(Fault):
     """The loss was no finite number; the last commit is from before."""
 
 
@@ -137,7 +137,10 @@ class Recorder:
     def refuse_divergence(self) -> None:
         """Raise Diverged if any loss so far was infinite or no number; waits for the device."""
         if (update := self.learner.first_nonfinite_update()) is not None:
-            raise Diverged(f"the loss of update {update} is no finite number; the run stays at its last commit")
+            raise Diverged(
+                f"the loss of update {update} is no finite number, and would be again; the run stays at its last "
+                "commit: lower optimizer.lr or set objective.reward_clip, which makes another run"
+            )
 
     def show(self, counters: Counters) -> None:
         """Let a person see how far it is; to be called after every step."""

@@ -118,6 +118,9 @@ class Trainer:
             phase.sampler.load_state_dict(state["samplers"][str(index)])
         self.scores, self.lengths = state["scores"], state["lengths"]
         self.recorder.load_state_dict(state)
+        for env in range(self.emulators.num_envs):
+            if not self.memory.is_under_way(env):  # what came before in its episode was lost
+                self.memory.begin(env, self.stack.state[env, -1])
 
     @property
     def has_ended(self) -> bool:

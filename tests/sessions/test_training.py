@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import os
+import re
 import signal
 import sqlite3
 import subprocess
@@ -18,6 +19,7 @@ from atlantis_exp.commands.overrides import read_override
 from atlantis_exp.commands.train import VERB
 from atlantis_exp.config import Config, PathsConfig
 from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.runs.facts import read_facts
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Artifact, Image, Journal, Metrics, Model, read
 from atlantis_exp.sessions.job import Job
@@ -291,6 +293,25 @@ def test_a_journal_that_was_cut_is_one_clear_line(tiny: Compose) -> None:
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(Fault, match="is shorter than the checkpoint says"):
         train(Job(tiny("evaluation.at_end=false", "evaluation.every_steps=null")))
+
+
+@pytest.mark.parametrize("sampler", ["uniform", "prioritized"])
+@pytest.mark.parametrize("damaged", ["oldest", "newest"])
+def test_a_damaged_part_of_the_replay_memory_costs_that_part_and_is_said(
+    tiny: Compose, sampler: str, damaged: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    overrides = (f"sampler={sampler}", "evaluation.every_steps=null", "tracking.commit_episodes=1", "env.num_envs=2")
+    train(Job(tiny(*overrides, "budget.steps=120")))
+    config = tiny(*overrides)
+    segments = sorted(RunFolder.of(config).checkpoints.glob("segments/*"))
+    for path in [segments[0]] if damaged == "oldest" else segments:
+        (path / "arrays.safetensors").write_bytes(b"damaged")
+    capsys.readouterr()
+    train(Job(config))
+    assert "no checkpoint has its whole replay memory: " in capsys.readouterr().out
+    facts = read_facts(RunFolder.of(config).path)
+    assert re.fullmatch(r"\d+ observations of the replay memory, at step 120", facts.tags["lost"])
+    assert RunFolder.of(config).state == "done"
 
 
 def points(outputs: Path, name: str) -> list[tuple[Any, ...]]:

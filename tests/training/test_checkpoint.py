@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.runs.journal import read_commit
 from atlantis_exp.training.checkpoint import FORMAT, CheckpointError, Checkpoints, _checksum
 from atlantis_exp.training.fingerprint import fingerprint
@@ -269,3 +269,22 @@ def test_a_death_at_any_file_operation_of_a_commit_leaves_the_commit_before_or_t
     assert steps == sorted(steps)
     assert set(steps) == {100, 160}
     assert len(steps) > 20
+
+
+@pytest.mark.parametrize(("damaged", "oldest", "lost"), [("000000000000", 100, 100), ("000000000100", 150, 150)])
+def test_where_a_segment_that_generations_share_is_damaged_the_observations_behind_it_go_on(
+    tmp_path: Path, damaged: str, oldest: int, lost: int
+) -> None:
+    checkpoints, memory = Checkpoints(tmp_path, "abc"), memory_of(100)
+    for step, end in enumerate((100, 150, 200), start=1):
+        checkpoints.save({"step": step}, memory_of(end, of=memory))
+    [path] = tmp_path.glob(f"segments/{damaged}*/arrays.safetensors")
+    path.write_bytes(b"")
+    state, loaded, said = restored(tmp_path)
+    assert state == {"step": 3}
+    assert (loaded.oldest_id, loaded.next_id) == (oldest, 200)
+    ids = np.flatnonzero(loaded.available(np.arange(200)))
+    assert len(ids) == len(loaded) > 0
+    ours, theirs = (each.gather(ids, Returns(0.9)) for each in (loaded, memory))
+    assert all(np.array_equal(getattr(ours, name), getattr(theirs, name)) for name in ours._fields)
+    assert said[-1] == f"no checkpoint has its whole replay memory: {lost} observations are lost, the run goes on"
