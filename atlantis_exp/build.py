@@ -121,8 +121,9 @@ def choose_device(name: str) -> torch.device:
     """The device of that name; `auto` is the GPU where there is one. Raises: ConfigError."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if name.startswith("cuda") and not torch.cuda.is_available():
-        raise ConfigError(f"device={name}: this machine has no CUDA device; valid: auto, cpu")
+    count = torch.cuda.device_count()
+    if name.startswith("cuda") and int(name.partition(":")[2] or 0) >= count:
+        raise ConfigError(f"device={name}: this machine has {count or 'no'} CUDA devices; valid: auto, cpu")
     return torch.device(name)
 
 

@@ -15,13 +15,18 @@ from atlantis_exp.registry import SMALLEST_SIDE
 
 STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
-Count = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=1, le=10**12)]
+Frameskip = Annotated[int, Field(ge=1, le=256)]
+Episodes = Annotated[int, Field(ge=1, le=10**6)]  # of one evaluation
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Size = Annotated[int, Field(ge=8, le=210)]
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Share = Annotated[float, Field(gt=0, lt=1)]
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
+
+_LONGEST = 10 * 365 * 24 * 3600  # seconds
 
 SCREEN = (210, 160)  # rows, columns of the emulator's screen
 
@@ -31,9 +36,9 @@ class EnvConfig:
     """One Atlantis and how its screen becomes an observation (report figure 2.3)."""
 
     id: Literal["Atlantis-v0", "ALE/Atlantis-v5"]
-    frameskip: Count | tuple[Count, Count]  # frames a step; a pair is drawn from [low, high)
+    frameskip: Frameskip | tuple[Frameskip, Frameskip]  # frames a step; a pair is drawn from [low, high)
     sticky: Probability
-    max_frames: Count  # frames an episode
+    max_frames: Annotated[int, Field(ge=1, lt=2**31)]  # frames an episode
     max_steps: Count | None  # steps an episode
     noop_max: Annotated[int, Field(ge=0, le=30)]  # steps
     max_pool: bool
@@ -106,7 +111,7 @@ class TargetConfig:
 class _BootstrapConfig:
     name: str
     gamma: Annotated[float, Field(ge=0, lt=1)]
-    n_step: Count  # rewards before the bootstrap
+    n_step: Annotated[int, Field(ge=1, le=1_000)]  # rewards before the bootstrap
     reward_scale: Positive
     reward_clip: Positive | None  # after scaling; null: not clipped
     terminal_on_life_loss: bool
@@ -125,7 +130,7 @@ class QuantileConfig(_BootstrapConfig):
     """The bootstrap target of a distribution's quantiles, and its loss."""
 
     name: Literal["quantile", "double_quantile"]
-    quantiles: Count
+    quantiles: Annotated[int, Field(ge=1, le=10_000)]
 
 
 ObjectiveConfig = Annotated[DqnConfig | QuantileConfig, Field(discriminator="name")]
@@ -256,7 +261,7 @@ class TrainingConfig:
 
     learn_every: Count  # steps
     learn_start: Annotated[int, Field(ge=0)]  # transitions in the memory
-    batch_size: Count  # transitions
+    batch_size: Annotated[int, Field(ge=1, le=2**24)]  # transitions
     precision: Literal["auto", "fp32", "bf16"]
     ema: Annotated[int, Field(ge=10)] | None = None  # updates over which evaluated weights are averaged; null: latest
 
@@ -265,22 +270,22 @@ class TrainingConfig:
 class ReplayConfig:
     """The replay memory's two bounds."""
 
-    capacity: Annotated[int, Field(ge=16)]  # observations
-    max_bytes: Annotated[int, Field(ge=2**20)]  # bytes, everything included
+    capacity: Annotated[int, Field(ge=16, le=10**9)]  # observations
+    max_bytes: Annotated[int, Field(ge=2**20, le=2**50)]  # bytes, everything included
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class EvaluationConfig:
     """Episodes at a fixed epsilon, played without touching the training."""
 
-    episodes: Count
-    interim_episodes: Count | None  # of an evaluation amid the training; null: as many as at its end
+    episodes: Episodes
+    interim_episodes: Episodes | None  # of an evaluation amid the training; null: as many as at its end
     epsilon: Probability
     every_episodes: Count | None  # training episodes between evaluations; null: none of them
     every_steps: Count | None  # training steps between evaluations; null: none of them
     at_end: bool
     num_envs: Annotated[int, Field(ge=1, le=64)]
-    seed: Annotated[int, Field(ge=0)]
+    seed: Seed
     video: bool
 
 
@@ -311,6 +316,8 @@ class BudgetConfig:
     def __post_init__(self) -> None:
         if self.seconds == 0:
             raise ConfigError(f"budget.wall_clock={self.wall_clock}: no time; write it as in 90s, 10min, 3h or 1h30m")
+        if self.seconds is not None and self.seconds > _LONGEST:
+            raise ConfigError(f"budget.wall_clock={self.wall_clock}: should be at most 10 years")
 
     @property
     def seconds(self) -> int | None:
@@ -337,7 +344,7 @@ class BaselineAgentConfig:
 class Config:
     """One training experiment."""
 
-    seed: Annotated[int, Field(ge=0, lt=2**63)]
+    seed: Seed
     resume: Literal["auto", "never", "must"]
     device: Device
     threads: Annotated[int, Field(ge=1, le=256)] | None

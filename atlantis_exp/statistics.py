@@ -14,10 +14,6 @@ HUMAN_SCORE = 29_028.1  # of the professional tester; the same table
 EARLY_FRAMES = 10_000_000  # of training, up to which published DQN stays below the random player or near it
 
 
-TABLE_COLUMNS = ("mean", "standard_error", "median", "interquartile_mean", "high", "low")
-"""The parts of a summary that a line of a table has, in their order."""
-
-
 @dataclass(frozen=True)
 class Summary:
     """Points of a score distribution, as the report prints them (figures 5.4, 5.5 and 5.9)."""

@@ -37,4 +37,8 @@ def main() -> None:
         sys.exit(2)
     else:
         verb, arguments = "train", sys.argv[1:]
-    importlib.import_module(f"atlantis_exp.commands.{verb.replace('-', '_')}").VERB.run(arguments)
+    try:
+        importlib.import_module(f"atlantis_exp.commands.{verb.replace('-', '_')}").VERB.run(arguments)
+    except KeyboardInterrupt:  # before there is anything to lose, or a verb would have said so
+        print("atlantis_exp: interrupted", file=sys.stderr)
+        sys.exit(130)  # 128 + SIGINT

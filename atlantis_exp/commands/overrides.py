@@ -36,7 +36,13 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
     for override in overrides:
         if override.is_sweep_override() and not multirun:
             raise ConfigError(f"{override.input_line}: several values are a sweep; add -m")
+    given: dict[str, str] = {}
+    for text, override in zip(texts, overrides, strict=True):
+        if (before := given.setdefault(_key(override), text)) != text:
+            raise ConfigError(f"{text}: {before} says something else; write one of the two")
     hydras = [override for override in overrides if _is_hydras(override)]
+    for override in hydras:
+        _refuse_hydras(override)
     overrides = [override for override in overrides if not _is_hydras(override)]
     try:
         with composing():
@@ -46,6 +52,17 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
     except (HydraException, OmegaConfBaseException) as error:
         reason = f": {error.__cause__}" if isinstance(error.__cause__, OmegaConfBaseException) else ""
         raise ConfigError(" ".join(re.split("Config search path|full_key:", f"{error}{reason}")[0].split())) from None
+
+
+def _refuse_hydras(override: Override) -> None:
+    """Let pass what chooses a launcher and sets it up: anything else of Hydra's names code or places."""
+    key = override.key_or_group
+    if key == "hydra.mode":
+        raise ConfigError(f"{override.input_line}: write -m for a sweep")
+    if override.is_delete() or (key != "hydra/launcher" and not key.startswith("hydra.launcher.")):
+        raise ConfigError(
+            f"{override.input_line}: of Hydra's own, hydra/launcher=NAME and hydra.launcher.KEY=VALUE pass"
+        )
 
 
 def swept(arguments: Sequence[str]) -> list[str]:
@@ -83,7 +100,7 @@ def _check_launcher(config_name: str, overrides: list[Override]) -> None:
         raise ConfigError("hydra/launcher=slurm: needs pip install 'atlantis-exp[slurm]'") from None
     if target.endswith(".SlurmLauncher") and shutil.which("srun") is None:
         raise ConfigError(f"hydra/launcher={name}: there is no srun here; submit from a machine of the cluster")
-    keys = {f"hydra.launcher.{key}" for key in settings.launcher}
+    keys = {f"hydra.launcher.{key}" for key in settings.launcher if key not in ("_target_", "submitit_folder")}
     for text, override in texts.items():
         key = ".".join(override.key_or_group.split(".")[:3])  # what is below, the user names
         if key.startswith("hydra.launcher.") and key not in keys:
@@ -104,11 +121,14 @@ def read_flags(arguments: Sequence[str]) -> tuple[list[str], bool]:
             raise ConfigError(f"{unknown[0]}: write all overrides together, before or after the flags")
         known = {option for action in parser._actions for option in action.option_strings}
         raise ConfigError(f"{unknown[0]}: no such flag; {nearest(unknown[0], known)}")
+    if flags.multirun and (shown := flags.cfg or flags.info):
+        raise ConfigError(
+            f"--{'cfg' if flags.cfg else 'info'} {shown}: shows one config; drop -m, and name one value a key"
+        )
     for flag in ("config_path", "config_name", "config_dir", "experimental_rerun"):
         if getattr(flags, flag) is not None:
             raise ConfigError(f"--{flag.replace('_', '-')}: the verb decides on its config; write overrides instead")
-    sweep = flags.multirun or "hydra.mode=MULTIRUN" in flags.overrides
-    return flags.overrides, sweep
+    return flags.overrides, flags.multirun
 
 
 def read_override(text: str) -> Override:
@@ -117,6 +137,8 @@ def read_override(text: str) -> Override:
         raise ConfigError(f"'{text}' is no override; write KEY=VALUE, as in model=resnet")
     try:
         return OverridesParser.create().parse_override(text)
+    except ValueError:  # Python's own
+        raise ConfigError(f"{text[:60]}...: a number of more than 4,300 digits") from None
     except HydraException:
         raise ConfigError(
             f"{text}: not readable; write KEY=VALUE, a list as KEY=[1,2], other characters in quotes as KEY='\"a ü\"'"

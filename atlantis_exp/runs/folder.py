@@ -12,10 +12,10 @@ from pydantic import TypeAdapter
 from atlantis_exp.checking import nearest, parse
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.runs import lock
 from atlantis_exp.runs.files import SMALL, read_file, write_file
 from atlantis_exp.runs.journal import Commit, Status, read_commit
-from atlantis_exp.statistics import TABLE_COLUMNS
 
 CONFIG, RESULT, COMMIT = "config.json", "result.json", "commit.json"
 TRACEBACK = "traceback.txt"

@@ -35,10 +35,10 @@ def export(
     stored, step = stored_weights(source, weights)
     packed, precision = pack(stored)
     reached, made = _history(source, step)
+    actor = build_exported_actor(trained, packed, device)
     folder.mkdir(parents=True, exist_ok=True)  # before the episodes, lest there be no place for their scores
     if any(folder.iterdir()):
         raise ConfigError(f"to={folder}: is not empty; name another folder")
-    actor = build_exported_actor(trained, packed, device)
     settings = replace(evaluation, video=False)
     progress = Progress()
     progress.say(f"{source.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")

@@ -6,8 +6,8 @@ from rich.table import Table
 
 from atlantis_exp import terminal
 from atlantis_exp.config import PathsConfig
+from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.runs.folder import all_runs
-from atlantis_exp.statistics import TABLE_COLUMNS
 from atlantis_exp.tracking.publishing import catch_up
 
 

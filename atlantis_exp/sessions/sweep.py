@@ -15,13 +15,13 @@ import numpy as np
 from atlantis_exp.checking import digest
 from atlantis_exp.faults import Fault
 from atlantis_exp.media import curves, strips
+from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.runs.folder import TRACEBACK, RunFolder, State
 from atlantis_exp.runs.journal import Journal, Status, adopt, curve
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.launchers import BASIC, Launcher, joblib, ray, slurm
 from atlantis_exp.sessions.live import LiveTable
-from atlantis_exp.statistics import TABLE_COLUMNS
 from atlantis_exp.tracking.publishing import catch_up, publishing
 
 _PAGE_SECONDS = 60.0  # between two looks at the runs while they are trained

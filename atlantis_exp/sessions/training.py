@@ -9,7 +9,7 @@ from functools import partial
 
 import torch
 
-from atlantis_exp.build import build_trainer
+from atlantis_exp.build import build_trainer, choose_device
 from atlantis_exp.checking import flatten, to_dict
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault, RunFault
@@ -32,6 +32,8 @@ def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> None:
     watch: asked after every step; where it says so, the run is committed and left to be continued.
     """
     config, folder = job.config, RunFolder.of(job.config)
+    if folder.status != "SCHEDULED":  # where a sweep has, its failure is to be recorded
+        choose_device(config.device)  # before anything is put aside or written
     if _has_ended(job, folder):
         return
     progress = Progress()

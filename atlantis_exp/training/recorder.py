@@ -14,10 +14,10 @@ import safetensors.torch
 from atlantis_exp.faults import Fault
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.media import score_heatmap, score_histogram
+from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.runs.folder import BEST_EPISODE, EPISODES, NETWORK, evaluation_at
 from atlantis_exp.runs.journal import Tracker
-from atlantis_exp.statistics import TABLE_COLUMNS
 from atlantis_exp.training.evaluation import Evaluation, Stopped
 from atlantis_exp.training.plan import Cadence, Counters, Plan
 from atlantis_exp.training.progress import Pace, Progress, Snapshot

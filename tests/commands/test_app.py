@@ -26,6 +26,10 @@ Command = Callable[..., int]
         "-m seed=0,-1 paths.outputs=o",
         "--cfg job model=cnm paths.outputs=o",
         "trian seed=1",
+        "--cfg job -m seed=0,1 paths.outputs=o",
+        "seed=1 seed=2 paths.outputs=o",
+        "replay.capacity=1000000000000000000 paths.outputs=o",
+        "device=cuda:99 paths.outputs=o",
     ],
 )
 def test_a_mistake_ends_with_code_2_and_one_line_and_leaves_nothing_behind(
@@ -91,3 +95,14 @@ def test_nothing_heavy_is_loaded_before_the_config_is_checked() -> None:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     heavy = {"torch", "mlflow", "ale_py", "gymnasium", "cv2", "matplotlib", "scipy", "av", "numpy"}
     assert heavy & set(done.stdout.split()) == set()
+
+
+def test_an_interrupt_while_a_verb_is_imported_is_one_line(
+    command: Command, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(_: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("atlantis_exp.commands.importlib.import_module", interrupted)
+    assert command("report") == 130
+    assert capsys.readouterr().err == "atlantis_exp: interrupted\n"

@@ -150,9 +150,37 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("--config-dir=/tmp", "--config-dir", "overrides"),
     ("--experimental-rerun=x.pickle", "--experimental-rerun", "overrides"),
     ("--info everything", "--info", "defaults"),
-    ("hydra.foo=1", "hydra.foo", ""),
+    # Hydra's own, which name code and places
+    ("hydra.foo=1", "hydra.foo=1", "hydra/launcher=NAME"),
     ("hydra/launcher=lsf", "hydra/launcher", "basic"),
-    ("hydra.mode=FOO", "hydra.mode=FOO", ""),
+    ("hydra.mode=MULTIRUN", "hydra.mode=MULTIRUN", "-m"),
+    *(
+        (f"-m seed=0,1 {text}", text, "hydra/launcher=NAME")
+        for text in (
+            *("hydra.sweeper._target_=os.system", "hydra.callbacks.x._target_=os.system", "hydra/sweeper=basic"),
+            *("hydra.job_logging.version=1", "hydra.searchpath=[file:///tmp]", "hydra.run.dir=/tmp/x"),
+            *("hydra.output_subdir=x", "hydra.job.chdir=true", "hydra.verbose=[a,b]", "hydra.sweep.dir=/tmp/x"),
+            *("~hydra.launcher", "hydra.launcher={a:1}"),
+        )
+    ),
+    # twice
+    ("seed=1 seed=2", "seed=2", "seed=1"),
+    ("model=cnn model=resnet", "model=resnet", "model=cnn"),
+    ("-m seed=0,1 seed=2", "seed=2", "seed=0,1"),
+    # too much
+    ("replay.capacity=1000000000000000000", "replay.capacity", "less than or equal to 1000000000"),
+    (f"seed={'9' * 5_000}", "seed=999", "digits"),
+    ("budget.wall_clock=99999999999999999999h", "budget.wall_clock", "10 years"),
+    ("budget.wall_clock=9999999999", "budget.wall_clock", "10 years"),
+    ("objective.n_step=1000000", "objective.n_step", "less than or equal to 1000"),
+    ("training.batch_size=100000000", "training.batch_size", "less than or equal to"),
+    ("env.frameskip=100000", "env.frameskip", "less than or equal to"),
+    ("env.max_frames=3000000000", "env.max_frames", "less than 2147483648"),
+    ("evaluation.seed=99999999999999999999", "evaluation.seed", "less than"),
+    ("objective=quantile objective.quantiles=100000000", "objective.quantiles", "less than or equal to"),
+    # a sweep has no one config to show
+    ("--cfg job -m seed=0,1", "--cfg", "drop -m"),
+    ("--info config -m seed=0,1", "--info", "drop -m"),
     # writing
     ("model", "'model'", "KEY=VALUE"),
     ("env.crop=[1", "env.crop=[1", "KEY=VALUE"),
@@ -195,7 +223,6 @@ def test_a_mistake_is_one_line_that_names_the_key_and_what_would_be_right(line: 
         "",
         "model=resnet sampler=top_half",
         "-m model=cnn,resnet sampler=uniform,top_half",
-        "seed=0,1 hydra.mode=MULTIRUN",
         "phase=two_phase sampler=top_half phase.second.lr=1e-4 phase.second.sampler=uniform",
         "phase=two_phase ~phase.second",
         "optimizer.lr=1",
@@ -203,7 +230,6 @@ def test_a_mistake_is_one_line_that_names_the_key_and_what_would_be_right(line: 
         "sampler@samplers.uniform=uniform",
         "env.frameskip=4 env.crop=[0,160,210,0] --cfg job --resolve",
         "paths.outputs='/tmp/ü und ü'",
-        "hydra.verbose=true",
         "device=cuda:1 threads=4",
         "--help",
     ],

@@ -107,6 +107,8 @@ def test_the_launcher_of_a_command_line_is_known_and_a_missing_extra_is_one_line
     assert launcher("config", ["-m", *words]) == Launcher("joblib", 3)
     with pytest.raises(ConfigError, match=r"n_jbos"):
         check("config", Config, ["-m", "seed=0,1", "hydra/launcher=joblib", "hydra.launcher.n_jbos=3"])
+    with pytest.raises(ConfigError, match=r"_target_=os.system: no such key"):  # which would be run
+        check("config", Config, ["-m", "seed=0,1", "hydra/launcher=joblib", "hydra.launcher._target_=os.system"])
     monkeypatch.setitem(sys.modules, "hydra_plugins.hydra_joblib_launcher.joblib_launcher", None)
     with pytest.raises(ConfigError, match=r"^hydra/launcher=joblib: needs pip install 'atlantis-exp\[joblib\]'$"):
         check("config", Config, ["-m", "seed=0,1", "hydra/launcher=joblib"])
