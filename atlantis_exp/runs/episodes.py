@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atlantis_exp.registry import SOURCES
-from atlantis_exp.runs.files import TABLE, read_file
+from atlantis_exp.runs.files import ARTIFACT, read_file
 
 Array = npt.NDArray[np.float64]
 
@@ -46,7 +46,7 @@ class EpisodeTable:
     def read(cls, path: Path) -> Self:
         """The table in a file. Raises: ValueError, OSError."""
         try:
-            header, *lines = csv.reader(io.StringIO(read_file(path, TABLE).decode(), newline=""), strict=True)
+            header, *lines = csv.reader(io.StringIO(read_file(path, ARTIFACT).decode(), newline=""), strict=True)
             rows = [dict(zip(header, line, strict=True)) for line in lines]
             return cls._of(rows)
         except (ValueError, KeyError, csv.Error) as error:

@@ -8,8 +8,7 @@ from typing import Any, BinaryIO
 from pydantic_core import from_json
 
 SMALL = 2**24  # bytes; what a run says of itself has some kilobytes
-TABLE = 2**28  # bytes, of an evaluation's episodes
-WEIGHTS = 2**31  # bytes, of one network; any other artifact is smaller
+ARTIFACT = 2**30  # bytes, of a table, a film or a network
 CHECKPOINT = 2**36  # bytes, of a whole replay memory
 
 

@@ -1,16 +1,18 @@
 """Run folders and an MLflow store, brought up to each other."""
 
+import shutil
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 from atlantis_exp.config import PathsConfig, TrackingConfig
 from atlantis_exp.faults import Fault
-from atlantis_exp.runs.folder import RunFolder, all_folders
-from atlantis_exp.tracking.store import Store, brought, publish
+from atlantis_exp.runs.folder import COMMIT, RunFolder, all_folders
+from atlantis_exp.tracking.store import Store, brought, patience, publish
 from atlantis_exp.tracking.travel import bring, is_here, place
 
 _CHANGES = ("brought", "published")
@@ -100,7 +102,7 @@ def _bring_all(outputs: Path, source: Store) -> Iterator[Look]:
             if is_here(folder, run):
                 yield Look("as here", run.name)
                 continue
-            with RunFolder(folder).held():
+            with _gone_unless_brought(folder), RunFolder(folder).held():
                 outcome = bring(run, folder, source, listed)
             reason = f"{folder} is another run, which stays" if outcome == "other" else ""
             yield Look(outcome, str(folder.relative_to(outputs)), reason)
@@ -110,11 +112,23 @@ def _bring_all(outputs: Path, source: Store) -> Iterator[Look]:
             yield Look("failed", run.name, _reason(error, source))
 
 
+@contextmanager
+def _gone_unless_brought(folder: Path) -> Iterator[None]:
+    """Leave no new folder where nothing is committed after the block."""
+    is_new = not folder.exists()
+    try:
+        yield
+    finally:
+        if is_new and not (folder / COMMIT).exists():
+            shutil.rmtree(folder, ignore_errors=True)
+
+
 def _reason(error: Exception, store: Store) -> str:
     """What went wrong with one run. Raises: Fault where it is the store that did."""
     if not isinstance(error, ValueError):  # which is what a run's own files raise
         try:
-            store.client.get_experiment(store.experiment_id)
+            with patience(60):
+                store.client.get_experiment(store.experiment_id)
         except Exception as fault:
             raise Fault(f"{store.uri} cannot be reached: {_first_line(fault)}") from None
     return _first_line(error)

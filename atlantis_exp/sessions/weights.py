@@ -5,7 +5,7 @@ import hashlib
 import safetensors.torch
 
 from atlantis_exp.faults import Fault
-from atlantis_exp.runs.files import WEIGHTS, read_file
+from atlantis_exp.runs.files import ARTIFACT, read_file
 from atlantis_exp.runs.folder import NETWORK, RunFolder
 from atlantis_exp.runs.journal import Model, model_file, read
 from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints
@@ -42,7 +42,7 @@ def _read(run: RunFolder, path: str, sha256: str) -> bytes:
     """An artifact with weights; an empty checksum, as 0.1.0 left it, is not checked."""
     file = run.artifact(path)
     try:
-        content = read_file(file, WEIGHTS)
+        content = read_file(file, ARTIFACT)
     except (OSError, ValueError) as error:
         raise Fault(f"run {run.name}: its weights cannot be read: {error}") from None
     if sha256 not in ("", hashlib.sha256(content).hexdigest()):

@@ -10,23 +10,24 @@ import logging
 import math
 import os
 import shutil
+import signal
 import sqlite3
 import threading
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 from urllib.parse import urlsplit
 from uuid import UUID, uuid5
 
 from pydantic import AliasChoices, Field, TypeAdapter
 
-from atlantis_exp.runs.files import SMALL, WEIGHTS, open_file, read_file, write_file
+from atlantis_exp.runs.files import ARTIFACT, SMALL, open_file, read_file, write_file
 from atlantis_exp.runs.folder import COMMIT, CONFIG, RESULT, TRACEBACK
 from atlantis_exp.runs.journal import (
     Artifact,
@@ -46,9 +47,16 @@ from atlantis_exp.tracking.views import experiment_tags
 if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import LoggedModel, Metric
-    from mlflow.store.artifact.artifact_repo import ArtifactRepository
+    from mlflow.store.artifact.mlflow_artifacts_repo import MlflowArtifactsRepository
+    from mlflow.store.entities import PagedList
+
+P = TypeVar("P")
 
 _log = logging.getLogger(__name__)
+
+_SECONDS = 60  # that a server may take for an answer, or for so many bytes of a file:
+_PIECE = 2**16
+_PAGES = 1_000  # of 1,000 runs each, that a server may list
 
 _POINTS = 500  # a call at least, where there are so many: fewer cost more each
 _PARAM_LENGTH = 6_000  # characters that MLflow keeps
@@ -108,10 +116,8 @@ class Store:
         published = "tags.`atlantis.folder` != ''"
         wanted = published if name is None else f'{published} AND attributes.run_name = "{name}"'
         found: list[StoredRun] = []
-        token: str | None = None
-        while token != "":
-            page = self.client.search_runs([self.experiment_id], wanted, page_token=token)
-            token = page.token or ""
+        search = partial(self.client.search_runs, [self.experiment_id], wanted)
+        for page in _pages(search):
             found += [
                 StoredRun(
                     run.info.run_id,
@@ -127,14 +133,9 @@ class Store:
 
     def models(self, run_id: str) -> "list[LoggedModel]":
         """Returns the models of a run."""
-        found: list[LoggedModel] = []
-        token: str | None = None
-        while token != "":
-            same = f"source_run_id = '{run_id}'"
-            page = self.client.search_logged_models([self.experiment_id], same, page_token=token)
-            token = page.token or ""
-            found += page
-        return found
+        same = f"source_run_id = '{run_id}'"
+        search = partial(self.client.search_logged_models, [self.experiment_id], same)
+        return [model for page in _pages(search) for model in page]
 
     def files(self, location: str) -> "Files":
         """Returns the files of a run or model, whose location the server names.
@@ -143,14 +144,14 @@ class Store:
             ValueError: where they are not behind the server: it may name no place on this machine, and no other server,
                 which would be sent this one's user and password.
         """
-        from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
+        from mlflow.store.artifact.mlflow_artifacts_repo import MlflowArtifactsRepository
 
         place = urlsplit(location)
         if place.scheme != "mlflow-artifacts":
             raise ValueError(f"its files are in {location}; only a server with --serve-artifacts gives them out")
         if place.netloc not in ("", urlsplit(self.uri).netloc):
             raise ValueError(f"its files are said to be on {place.netloc}, another server, which is not asked")
-        return Files(get_artifact_repository(location, tracking_uri=self.uri))
+        return Files(MlflowArtifactsRepository(location, self.uri))
 
     def prepare(self) -> None:
         """Makes the experiment explain itself and seeds its shared views, see `views`."""
@@ -206,7 +207,9 @@ class Store:
                 with closing(sqlite3.connect(database_file)) as database:
                     database.execute("PRAGMA journal_mode=WAL")  # else one slow reader makes a write fail
             client = MlflowClient(self.uri)
-            if experiment := client.get_experiment_by_name(self._experiment):
+            with nullcontext() if self.is_local else patience(_SECONDS):
+                experiment = client.get_experiment_by_name(self._experiment)
+            if experiment:
                 return client, experiment.experiment_id
             # MLflow's own choice would depend on the working directory of whoever comes first.
             location = (self._root / "artifacts" / self._experiment).as_uri() if self.is_local else None
@@ -218,20 +221,74 @@ class Store:
                 raise
 
 
+class TooSlow(Exception):
+    """A server that has not answered in full by the time it had; no OSError, which clients take for one to retry."""
+
+
+@contextmanager
+def patience(seconds: int) -> Iterator[None]:
+    """Raise TooSlow in the block after so many seconds: a server that sends a byte now and then never times out.
+
+    Only in the main thread, where a signal can end a wait.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def give_up(*_: object) -> None:
+        raise TooSlow(f"the server has not answered in full within {seconds} seconds")
+
+    before = signal.signal(signal.SIGALRM, give_up)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _pages(search: "Callable[..., PagedList[P]]") -> "Iterator[PagedList[P]]":
+    """The pages of a search, as far as there may be."""
+    token: str | None = None
+    for _ in range(_PAGES):
+        with patience(_SECONDS):
+            page = search(page_token=token)
+        yield page
+        if not (token := page.token):
+            return
+    raise ValueError(f"the server lists more than {_PAGES:,} pages")
+
+
 class Files:
     """The files of a run or model on a server, by their paths."""
 
-    def __init__(self, repository: "ArtifactRepository") -> None:
+    def __init__(self, repository: "MlflowArtifactsRepository") -> None:
         self._repository = repository
 
     def names(self, folder: str) -> set[str]:
         """Returns the names of what lies in a folder, none where there is no such folder."""
-        return {os.path.basename(file.path) for file in self._repository.list_artifacts(folder)}
+        with patience(_SECONDS):
+            return {os.path.basename(file.path) for file in self._repository.list_artifacts(folder)}  # type: ignore[no-untyped-call]
 
-    def read(self, path: str) -> bytes:
-        """Returns what a file holds."""
-        with TemporaryDirectory() as aside:
-            return Path(self._repository.download_artifacts(path, aside)).read_bytes()  # type: ignore[no-untyped-call]
+    def read(self, path: str, most: int) -> bytes:
+        """Returns what a file of at most so many bytes holds. Raises: ValueError, TooSlow."""
+        from mlflow.utils.credentials import get_default_host_creds
+        from mlflow.utils.rest_utils import http_request
+
+        with patience(_SECONDS):
+            host = get_default_host_creds(self._repository.artifact_uri)  # type: ignore[no-untyped-call]
+            response = http_request(host, f"/{path}", "GET", stream=True)  # type: ignore[no-untyped-call]
+        with closing(response):
+            response.raise_for_status()
+            content, chunks = bytearray(), response.iter_content(_PIECE)
+            while True:
+                with patience(_SECONDS):
+                    chunk = next(chunks, b"")
+                if not chunk:
+                    return bytes(content)
+                content += chunk
+                if len(content) > most:
+                    raise ValueError(f"{path} has more than {most:,} bytes on the server")
 
 
 def unfinished(folder: Path, root: Path) -> Store | None:
@@ -504,7 +561,7 @@ class _Mirror:
         if isinstance(record, Artifact | Image | Model) and not (self._artifacts / record.path).is_file():
             _log.warning("%s is gone and cannot be published", self._artifacts / record.path)
             return
-        if isinstance(record, Model) and not record.is_whole(read_file(self._artifacts / record.path, WEIGHTS)):
+        if isinstance(record, Model) and not record.is_whole(read_file(self._artifacts / record.path, ARTIFACT)):
             _log.warning("%s is not what was recorded and is not published", self._artifacts / record.path)
             return
         match record:
@@ -538,7 +595,7 @@ class _Mirror:
         from PIL.Image import open as open_image
 
         name = image_name(self._run_id, record)
-        self._send_file(f"{name}.png", read_file(self._artifacts / record.path, WEIGHTS))
+        self._send_file(f"{name}.png", read_file(self._artifacts / record.path, ARTIFACT))
         with open_image(self._artifacts / record.path) as image:
             self._client.log_image(self._run_id, compress_image_size(image), f"{name}+compressed.webp")
         self._send_tags({"mlflow.loggedImages": "True"})

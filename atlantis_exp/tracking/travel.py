@@ -15,7 +15,7 @@ from math import inf
 from pathlib import Path
 from typing import Literal, Self
 
-from atlantis_exp.runs.files import write_file
+from atlantis_exp.runs.files import ARTIFACT, SMALL, write_file
 from atlantis_exp.runs.folder import COMMIT
 from atlantis_exp.runs.journal import (
     Artifact,
@@ -40,6 +40,7 @@ from atlantis_exp.tracking.store import (
     brought,
     files_digest,
     image_name,
+    patience,
     small_files,
 )
 
@@ -81,11 +82,14 @@ def bring(run: StoredRun, folder: Path, store: Store, listed: Collection[str]) -
         ValueError: on what cannot be a run folder's; the folder stays as it was.
         MlflowException, OSError: when the server cannot be reached.
     """
-    files = store.files(store.client.get_run(run.run_id).info.artifact_uri)
+    with patience(60):
+        files = store.files(store.client.get_run(run.run_id).info.artifact_uri)
     names = files.names(TRAVELS)
-    small = {name: files.read(f"{TRAVELS}/{name}") for name in (COMMIT, *SMALL_FILES) if name in names}
+    small = {name: files.read(f"{TRAVELS}/{name}", SMALL) for name in (COMMIT, *SMALL_FILES) if name in names}
     if files_digest(small) != run.tags.get(FILES_TAG):
         return "growing"
+    if COMMIT not in small:
+        raise ValueError(f"the server lacks its {COMMIT}")
     commit = commit_of(small[COMMIT])
     _check_parent(folder, commit.parent)
     local = _Local.of(folder, store)
@@ -163,7 +167,7 @@ def _journal(files: Files, start: int, end: int) -> Iterator[bytes]:
             break
         if following <= start:
             continue
-        with gzip.GzipFile(fileobj=io.BytesIO(files.read(f"{_JOURNAL}/{begin:012d}.gz"))) as packed:
+        with gzip.GzipFile(fileobj=io.BytesIO(files.read(f"{_JOURNAL}/{begin:012d}.gz", 2 * CHUNK))) as packed:
             piece = packed.read(CHUNK)[start - begin : end - begin]
         yield piece
         start += len(piece)
@@ -181,13 +185,13 @@ def _bring_files(
     for path, record in named.items():
         if isinstance(record, Model):
             model = models.get((record.name, str(record.step)))
-            content = store.files(model.artifact_location).read(os.path.basename(path)) if model else None
+            content = store.files(model.artifact_location).read(os.path.basename(path), ARTIFACT) if model else None
         else:
             there = f"{image_name(run.run_id, record)}.png" if isinstance(record, Image) else path
             above, name = os.path.split(there)
             if above not in listed:
                 listed[above] = files.names(above)
-            content = files.read(there) if name in listed[above] else None
+            content = files.read(there, ARTIFACT) if name in listed[above] else None
         if isinstance(record, Model) and content is not None and not record.is_whole(content):
             raise ValueError(f"{path} does not have the checksum that its journal gives it")
         if content is None:

@@ -6,8 +6,9 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager, closing, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
@@ -16,6 +17,7 @@ from typing import Any
 import PIL.Image
 import pytest
 from hydra import compose, initialize_config_dir
+from mlflow.store.entities import PagedList
 
 from atlantis_exp.commands.composing import CONF, checked
 from atlantis_exp.commands.sync import SyncConfig
@@ -26,7 +28,7 @@ from atlantis_exp.runs.journal import Commit, Journal, adopt, commit_bytes, read
 from atlantis_exp.sessions.syncing import sync
 from atlantis_exp.tracking import travel
 from atlantis_exp.tracking.publishing import catch_up
-from atlantis_exp.tracking.store import Store, files_digest, publish, unfinished
+from atlantis_exp.tracking.store import Store, TooSlow, _pages, files_digest, publish, unfinished
 
 REPOSITORY = Path(__file__).parents[2]
 Served = Callable[[Path, int], AbstractContextManager[None]]
@@ -372,3 +374,53 @@ def test_a_server_out_of_reach_and_a_damaged_folder_are_one_line_each(
     with pytest.raises(Fault, match="1 of 2 runs failed"):
         synced(tmp_path)
     assert "commit.json is damaged" in capsys.readouterr().err
+
+
+def test_a_server_that_drips_is_given_up(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A byte now and then keeps every single wait short, and a page token keeps every list going."""
+    dripped = bytearray()
+
+    class Drip(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Length", "100000")
+            self.end_headers()
+            with suppress(OSError):
+                while True:
+                    self.wfile.write(b" ")
+                    dripped.append(0)
+                    time.sleep(0.2)
+
+        do_POST = do_GET
+
+        def log_message(self, *_: object) -> None: ...
+
+    monkeypatch.setattr("atlantis_exp.tracking.store._SECONDS", 2)
+    with ThreadingHTTPServer(("127.0.0.1", 0), Drip) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        uri = f"http://127.0.0.1:{server.server_address[1]}"
+        began = time.monotonic()
+        with pytest.raises(TooSlow):
+            Store(tmp_path, "x", uri).files("mlflow-artifacts:/a").read("b", 1_000)
+        with pytest.raises(Fault, match="cannot be reached"):
+            synced(tmp_path, f"from={uri}")
+        server.shutdown()
+    assert len(dripped) > 10
+    assert time.monotonic() - began < 30
+
+
+def test_lists_and_files_without_end_are_refused(
+    server: tuple[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    uri, _ = server
+    a_sweep_of_one(tmp_path / "outputs", "large")
+    synced(tmp_path / "outputs", f"to={uri}", "tracking.experiment=large")
+    monkeypatch.setattr(travel, "SMALL", 10)
+    with pytest.raises(Fault, match="2 of 2 runs failed"):
+        synced(tmp_path / "laptop", f"from={uri}", "tracking.experiment=large")
+    assert "has more than 10 bytes on the server" in capsys.readouterr().err
+    assert not list((tmp_path / "laptop").glob("*/*/*"))  # nothing of what was refused
+
+    monkeypatch.setattr("atlantis_exp.tracking.store._PAGES", 5)
+    with pytest.raises(ValueError, match="lists more than 5 pages"):
+        list(_pages(lambda page_token: PagedList([], f"{page_token}more")))
