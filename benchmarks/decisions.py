@@ -13,6 +13,7 @@ from itertools import product
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import stdtrit
 from scipy.stats import norm
 
 from atlantis_exp.decision import Decision, Look, Plan, decide, mean_interval
@@ -106,6 +107,43 @@ def found(values: Values, plan: Plan) -> tuple[float, float]:
     decision, seeds = advised(values, plan)
     pairs = [verdict.said == "better" for verdict in decision.verdicts if verdict.group == "group 0"]
     return float(np.mean(pairs)), seeds
+
+
+def before(values: Values, every: bool) -> tuple[bool, int]:
+    """Whether two groups were found to differ before there was a plan, and after how many seeds.
+
+    From three seeds on Welch's 95 % interval was tested, after every seed or after "about K more seeds", the number at
+    which the interval would leave out zero if means and variances stayed as they were.
+    """
+    trained = 3
+    while True:
+        seeds = values[:, :trained]
+        distance, variances = abs(seeds[0].mean() - seeds[1].mean()), seeds.var(axis=1, ddof=1)
+        sizes = np.arange(trained, SEEDS + 1)
+        freedom = variances.sum() ** 2 * (sizes - 1) / (variances**2).sum()
+        enough = distance > -stdtrit(freedom, 0.025) * np.sqrt(variances.sum() / sizes)
+        if enough[0] or trained == SEEDS:
+            return bool(enough[0]), trained
+        trained = trained + 1 if every else int(sizes[enough.argmax() if enough.any() else -1])
+
+
+def at_once(values: Values) -> tuple[bool, int]:
+    """Whether one look at ten seeds finds that two groups differ."""
+    return false_decision(values, Plan(looks=(SEEDS,)), advised), SEEDS
+
+
+def by_plan(values: Values) -> tuple[bool, int]:
+    """Whether looks at five and ten seeds find that two groups differ, and the seeds that it takes."""
+    decision, seeds = advised(values, Plan())
+    return decision.verdicts[0].said != "not decided", seeds
+
+
+PROCEDURES: Mapping[str, Callable[[Values], tuple[bool, int]]] = {
+    "before: a test at each of 3 to 10 seeds": lambda values: before(values, every=True),
+    'before: "about K more seeds", followed to 10': lambda values: before(values, every=False),
+    "one look at 10 seeds": at_once,
+    "now: looks at 5 and 10 seeds": by_plan,
+}
 
 
 def covered(values: Values, means: Values, plan: Plan) -> tuple[float, float]:
@@ -202,6 +240,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
         [(cell, percent(x["power"]), f"{x['seeds']:.1f}", percent(x["power_at_ten"])) for cell, x in power.items()],
     )
 
+    after: dict[str, dict[str, dict[str, float]]] = {}
+    for procedure, (shape, draw) in product(PROCEDURES, SHAPES.items()):
+        drawn = draw(np.random.default_rng(1), (count, 2, SEEDS))  # the same for all procedures
+        wrongly = np.mean([PROCEDURES[procedure](values) for values in drawn], axis=0)[0]
+        apart = np.array([[1.0], [0.0]])  # sd
+        decided, trained = np.mean([PROCEDURES[procedure](values + apart) for values in drawn], axis=0)
+        measured = {"false": float(wrongly), "power": float(decided), "seeds": float(trained)}
+        after.setdefault(procedure, {})[shape] = measured
+    print_table(
+        "two groups: decided though equal, in %; decided at 1 sd, in %; mean seeds at 1 sd",
+        ("", "false", "power", "seeds"),
+        [
+            (f"{procedure}; {shape}", percent(row["false"]), percent(row["power"]), f"{row['seeds']:.1f}")
+            for procedure, rows in after.items()
+            for shape, row in rows.items()
+        ],
+    )
+
     plans = {"5 and 10": plan, "10": single, "10 and 20": Plan(looks=(10, 20))}
     mixtures = {
         "bimodal 70:30 and steady": (bimodal, steady),
@@ -271,6 +327,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "false_decisions": wrong,
             "power": {cell: [row["power"], row["power_at_ten"]] for cell, row in power.items()},
             "seeds": {cell: row["seeds"] for cell, row in power.items()},
+            "before_and_after": after,
             "different_shapes": shapes,
             "equivalent": equivalent,
             "coverage": coverage,

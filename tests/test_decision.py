@@ -20,6 +20,7 @@ from atlantis_exp.decision import (
     decide,
     detectable,
     equal_scores,
+    equivalence,
     looks_up_to,
     mean_interval,
     modes,
@@ -410,6 +411,14 @@ def test_the_detectable_difference_is_found_in_eighty_of_a_hundred_and_takes_the
     verdicts = [followed(each).verdicts[0] for each in rows]
     assert np.mean([verdict.said == "better" for verdict in verdicts]) == pytest.approx(chance, abs=0.05)
     assert np.mean([verdict.seeds for verdict in verdicts]) == pytest.approx(foretold, abs=0.3)
+
+
+def test_two_groups_of_one_mean_are_found_equivalent_in_eighty_of_a_hundred_within_the_delta_that_is_foretold() -> None:
+    delta = equivalence(PLAN, 1.0)
+    rows = np.random.default_rng(3).normal(size=(400, 2, 10))
+    said_of = [followed(each, Plan(delta=delta)).verdicts[0].said for each in rows]
+    assert np.mean([said == "equivalent" for said in said_of]) == pytest.approx(0.8, abs=0.05)
+    assert equivalence(PLAN, 2.0, pairs=3) > 2 * delta
 
 
 def test_power_at_no_difference_is_the_error_of_the_last_look_and_seeds_end_where_nothing_is_left_to_find() -> None:

@@ -3,8 +3,8 @@
 import dataclasses
 import itertools
 from collections.abc import Callable
-from functools import partial
-from typing import Annotated
+from functools import cache, partial
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -12,10 +12,13 @@ from pydantic.dataclasses import dataclass
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.compare import margin
 from atlantis_exp.commands.jobs import training_of
-from atlantis_exp.commands.overrides import read_flags, read_override, swept
+from atlantis_exp.commands.overrides import check, read_flags, read_override, swept
 from atlantis_exp.config import STRICT, Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import command_line
+
+if TYPE_CHECKING:
+    from atlantis_exp.sessions.deciding import Request
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -35,54 +38,69 @@ class DecideConfig(Config):
 
 
 _OWN = {field.name for field in dataclasses.fields(DecideConfig)} - {field.name for field in dataclasses.fields(Config)}
-_CLOSED = ("seed", "resume", "device", "threads", "compile", "evaluation", "tracking", "budget", "paths")
+_CLOSED = _OWN | {"seed", "resume", "device", "threads", "compile", "evaluation", "tracking", "budget", "paths"}
+_LAUNCHER = ("hydra/launcher=", "hydra.launcher.")
 
 
 def _first_contender(arguments: list[str]) -> list[str]:
-    """Give Hydra one value of each key that tells contenders apart, and no launcher: it composes, and runs nothing."""
-    if read_flags(arguments)[1]:
+    """Leave out the keys that tell contenders apart, and the launcher: what they share is composed, and run here."""
+    texts, is_sweep = read_flags(arguments)
+    if is_sweep:
         raise ConfigError("-m: decide plans its own sweeps; drop -m")
-    dropped = (*swept(arguments), *(text for text in arguments if text.startswith(("hydra/", "hydra."))))
+    for text in texts:
+        key, _, value = text.partition("=")
+        if key == "seed":
+            raise ConfigError(f"{text}: decide trains seeds from 0 on, as many as it needs; drop it")
+        if key == "resume" and value != "auto":
+            raise ConfigError(f"{text}: decide goes on with the runs that are there; drop it")
+    dropped = (*swept(arguments), *(text for text in texts if text.startswith(_LAUNCHER)))
     return [argument for argument in arguments if argument not in dropped]
 
 
 def _work(asked: Asked[DecideConfig]) -> Callable[[], None]:
-    from atlantis_exp.comparison.verdict import Question
-    from atlantis_exp.sessions.deciding import Request, decide
+    from atlantis_exp.sessions.deciding import decide
 
-    config = asked.config
-    several = swept(asked.typed)
-    if not several:
-        raise ConfigError("nothing to decide between: give a key several values, as in model=cnn,resnet_fast")
-    keys = [read_override(text).key_or_group for text in several]
-    for key in keys:
+    return partial(decide, request_of(asked))
+
+
+def request_of(asked: Asked[DecideConfig]) -> "Request":
+    """The question that was asked. Raises: ConfigError for one that cannot be decided."""
+    from atlantis_exp.comparison.verdict import Question
+    from atlantis_exp.sessions.deciding import Request
+
+    config, several = asked.config, swept(asked.typed)
+    choices = []
+    for text in several:
+        override = read_override(text)
+        key = override.key_or_group
         if key.split(".")[0] in _CLOSED:
             raise ConfigError(f"{key}: says how contenders are trained or measured, not what they are; one value only")
         if key == "experiment":
             raise ConfigError(
                 "experiment: a preset is no single key; name those that differ, as in objective=dqn,quantile"
             )
-    fixed = [text for text in asked.overrides if text.lstrip("+~").split("=")[0].split(".")[0] not in _OWN]
-    launchers = [text for text in asked.typed if text.startswith(("hydra/launcher=", "hydra.launcher."))]
+        if not (override.is_choice_sweep() or override.is_range_sweep()):
+            raise ConfigError(f"{text}: no list of values; write them out, as in model=cnn,resnet_fast")
+        choices.append([f"{text.split('=', 1)[0]}={value}" for value in override.sweep_string_iterator()])
+    contenders = list(itertools.product(*choices))
+    if len(contenders) < 2:
+        raise ConfigError("nothing to decide between: give a key several values, as in model=cnn,resnet_fast")
+    texts = read_flags(asked.typed)[0]  # as typed: Hydra has put values in the place of ${...}
+    shared = [text for text in texts if text not in several and not text.startswith(("hydra.", "hydra/"))]
+    fixed = [text for text in shared if text.lstrip("+~").split("=")[0].split(".")[0] not in _OWN]
+    launcher = [text for text in asked.typed if text.startswith(_LAUNCHER)]
+    check("config", Config, ["-m", *launcher, *several, *fixed])
     delta, relative = margin(config.delta)
-    request = Request(
-        question=Question(tuple(keys), config.seeds, config.error, delta, relative, config.baseline),
-        contenders=[
-            tuple(chosen)
-            for chosen in itertools.product(
-                *(
-                    [f"{text.split('=', 1)[0]}={value}" for value in read_override(text).sweep_string_iterator()]
-                    for text in several
-                )
-            )
-        ],
+    keys = tuple(read_override(text).key_or_group for text in several)
+    return Request(
+        question=Question(keys, config.seeds, config.error, delta, relative, config.baseline),
+        contenders=contenders,
         several=several,
         fixed=fixed,
-        launcher=launchers,
-        job_of=training_of,
+        launcher=launcher,
+        job_of=cache(training_of),
         command=command_line("decide", *asked.typed),
     )
-    return partial(decide, request)
 
 
 VERB = Verb("decide", DecideConfig, _work, rewrite=_first_contender)

@@ -12,7 +12,7 @@ from atlantis_exp.sessions.job import command_line
 from atlantis_exp.sessions.launchers import Launcher
 
 
-def _work(asked: Asked[Config]) -> Callable[[], None]:
+def _work(asked: Asked[Config]) -> Callable[[], object]:
     job = job_of(asked)
     match asked.launcher:
         case None:

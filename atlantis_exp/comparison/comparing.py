@@ -7,12 +7,13 @@ from dataclasses import asdict
 from pathlib import Path
 from time import strftime
 
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from atlantis_exp import terminal
 from atlantis_exp.checking import digest, flatten
 from atlantis_exp.comparison import tables
+from atlantis_exp.comparison.export_tables import to_latex, to_parquet, with_units
 from atlantis_exp.comparison.figures import draw
 from atlantis_exp.comparison.gather import COMMIT, Training, gather, group, refuse_mixed_protocols, select
 from atlantis_exp.comparison.looks import read_looks, write_looks
@@ -94,7 +95,9 @@ def compare(
             for name, figure in figures.items():
                 journal.artifact(f"figures/{name}.png", figure.png)
             for name, table in comparison.tables.items():
-                journal.artifact(f"tables/{name}.csv", tables.to_csv(table).encode())
+                journal.artifact(f"tables/{name}.csv", tables.to_csv(with_units(name, table)).encode())
+                journal.artifact(f"tables/{name}.tex", to_latex(name, table).encode())
+                journal.artifact(f"tables/{name}.parquet", to_parquet(name, table))
             journal.finish()
     _print(comparison)
     print(f"\n{folder.artifact(_PAGE)}")
@@ -138,8 +141,7 @@ def _metrics(comparison: Comparison) -> dict[str, float]:
 
 
 def _print(comparison: Comparison) -> None:
-    console = Console(highlight=False)
-    console = Console(highlight=False, width=max(console.width, 160))
+    console = terminal.console(least=160)
     for name, title in (("scores", "scores"), ("evaluation", "episodes")):
         header, *rows = plain(name, comparison.tables[name])
         table = Table(*header, title=f"{title} after the last step, by {', '.join(comparison.by)}")
@@ -149,14 +151,14 @@ def _print(comparison: Comparison) -> None:
             table.add_row(*map(Text, row))
         console.print(table)
     for note in comparison.notes:
-        console.print(f"- {note}", markup=False)
+        console.print(f"- {note}")
     console.print()
     for each in comparison.answers:
-        console.print(f"By {each.family.name}: {spent(each)}.", markup=False)
+        console.print(f"By {each.family.name}: {spent(each)}.")
     for sentence in comparison.beside:
-        console.print(f"- {sentence}", markup=False)
+        console.print(f"- {sentence}")
     for sentence in (*reversed(comparison.others), comparison.verdict):
-        console.print(f"\n{sentence}", markup=False)
+        console.print(f"\n{sentence}")
 
 
 def _slug(groups: list[str]) -> str:

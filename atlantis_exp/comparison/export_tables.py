@@ -4,6 +4,7 @@ import io
 import re
 import unicodedata
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from typing import Any
 
 from atlantis_exp.comparison.gather import AXES
@@ -37,7 +38,7 @@ UNITS: Mapping[str, str] = {
     "steps_mean": "steps",
     "hours": "hours",
     "flops": "FLOPs",
-    **dict.fromkeys(("seeds", "look", "next_look"), "seeds"),
+    **dict.fromkeys(("seeds", "next_look"), "seeds"),
 }
 """A column of a comparison's tables, or of `load_runs`, to its unit; frames are the emulator's, FLOPs those of gradient
 updates. A column that is not here counts something that its name says, or is no quantity."""
@@ -196,6 +197,7 @@ _LATEX = {
 }
 
 
+@lru_cache(10_000)  # the same labels stand in thousands of rows
 def _escaped(text: str) -> str:
     """A text as LaTeX that shows just its characters, on one line; what is no character to be seen is a space."""
     seen = "".join(" " if unicodedata.category(letter)[0] in "CZ" else letter for letter in text)

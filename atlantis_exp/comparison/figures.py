@@ -27,6 +27,7 @@ _LINES = ("-", "--", "-.", ":")
 _GREY = "#6e7781"  # of what is averaged over several groups
 _INK = "#24292f"  # of text and axes; a page lets it follow its own
 _STYLE = {
+    "text.parse_math": False,  # a dollar sign in a name is one
     **dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), _INK),
     "font.size": 10,
     "axes.spines.top": False,

@@ -106,11 +106,13 @@ def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None
     A training's episodes are those of its latest evaluation after its last step, be it the training's own or one that
     the verb `evaluate` made; given `epsilon`, of the latest at that epsilon. What resume=never put aside is left out
     unless it is asked for, as it is where commits are compared: it is what an earlier one made of the same recipe.
+    The name of a decision among `runs` stands for the runs that it rests on.
     """
+    patterns = [pattern for text in runs for pattern in _runs_of_decision(outputs, text) or [text]]
     gathered = Gathered()
     evaluations = _evaluations(outputs, gathered.skipped)
     for folder in [RunFolder(path) for path in sorted((outputs / "runs").glob("*")) if path.is_dir()]:
-        if runs and not any(fnmatchcase(folder.name, f"{pattern}*") for pattern in runs):
+        if runs and not any(fnmatchcase(folder.name, f"{pattern}*") for pattern in patterns):
             continue
         try:
             tree = _config(folder, put_aside)
@@ -125,6 +127,12 @@ def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None
         except (Fault, ValueError, KeyError, TypeError, OSError) as error:
             gathered.skipped[folder.name] = f"broken: {error}"
     return gathered
+
+
+def _runs_of_decision(outputs: Path, name: str) -> list[str]:
+    """The runs that a decision rests on, none where there is no decision of that name. Raises: Fault."""
+    folders = [RunFolder(path) for path in (outputs / "decisions").glob("decide-*") if path.name == name]
+    return [str(run) for folder in folders for run in folder.config.get("runs", ())]
 
 
 def select(trainings: Iterable[Training], where: Sequence[str]) -> list[Training]:

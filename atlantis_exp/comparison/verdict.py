@@ -184,6 +184,8 @@ def _family(
 def answer(asked: Sequence[Family], record: Mapping[str, Sequence[Look]], now: bool = False) -> list[Answer]:
     """Take the looks that are due in each family, or with `now` one at the seeds there are.
 
+    Where a look decides some pairs, those that are left may have the seeds of the next one already.
+
     Args:
         record: the looks taken before, by family.
     """
@@ -191,6 +193,8 @@ def answer(asked: Sequence[Family], record: Mapping[str, Sequence[Look]], now: b
     for family in asked:
         before = record.get(family.name, ())
         decision = decide(family.seeds, family.plan, before, now=now)
+        while len((further := decide(family.seeds, family.plan, decision.looks)).looks) > len(decision.looks):
+            decision = further
         taken = decision.looks[-1] if len(decision.looks) > len(before) else None
         answers.append(Answer(family, decision, taken))
     return answers

@@ -9,29 +9,32 @@ import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import sqrt
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
+from atlantis_exp import terminal
 from atlantis_exp.build import build_trainer
 from atlantis_exp.checking import digest, flatten, to_dict
 from atlantis_exp.comparison.comparing import compare
-from atlantis_exp.comparison.gather import values_in
+from atlantis_exp.comparison.gather import resolve, values_in
 from atlantis_exp.comparison.published import literature
 from atlantis_exp.comparison.tables import Comparison
-from atlantis_exp.comparison.verdict import Question, wanted
+from atlantis_exp.comparison.verdict import Family, Group, Question, families, wanted
 from atlantis_exp.config import TrackingConfig
-from atlantis_exp.decision import Plan, detectable, looks_up_to
+from atlantis_exp.decision import detectable, equivalence, looks_up_to
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import Journal, NullJournal
+from atlantis_exp.runs.journal import Journal, Metrics, NullJournal, read
 from atlantis_exp.runs.provenance import provenance
-from atlantis_exp.sessions.job import Job, labels
-from atlantis_exp.sessions.sweep import ledger
+from atlantis_exp.sessions.job import Job, command_line, labels
+from atlantis_exp.sessions.sweep import ledger, terminable
 from atlantis_exp.sessions.training import expected, train
 from atlantis_exp.tracking.publishing import catch_up, publishing
+from atlantis_exp.training.forecast import duration
 from atlantis_exp.training.progress import Progress
 
 _SPARE = 2  # times the plan's seeds that may be trained, since equal games count once
@@ -45,10 +48,8 @@ class Request:
     contenders: Sequence[tuple[str, ...]]  # the overrides that tell each from the others
     several: Sequence[str]  # the overrides with several values, as typed
     fixed: Sequence[str]  # the overrides that all contenders share
-    launcher: Sequence[
-        str
-    ]  # the overrides that choose what runs the trainings; none: this process, one after the other
-    job_of: Callable[[Sequence[str]], Job]  # the training that overrides make; raises ConfigError
+    launcher: Sequence[str]  # the overrides that choose what runs the trainings; none: this process, one by one
+    job_of: Callable[[tuple[str, ...]], Job]  # the training that overrides make; raises ConfigError
     command: str  # that continues it
 
 
@@ -57,35 +58,36 @@ def decide(request: Request) -> None:
 
     Raises:
         ConfigError: where two contenders are the same training, or the baseline is none of them.
-        Fault: where a training fails; the same command goes on.
+        Fault: where a training fails, or a contender's seeds cannot be told apart; the same command goes on.
     """
     session = _Session.of(request)
     outputs = session.outputs
     catch_up(outputs)
     shown = labels(f"decide {' '.join(request.several)}", run_colour("decide"), "decision")
-    try:
-        with session.folder.held(), publishing(session.folder, session.tracking, outputs, shown) as journal:
-            session.folder.write_config({"command": request.command, "runs": session.names})
+    with session.folder.held(), terminable(), publishing(session.folder, session.tracking, outputs, shown) as journal:
+        try:
             journal.resume()
             journal.tags(provenance(request.command))
             journal.status("RUNNING")
             session.say_what_it_takes()
-            try:
-                while True:
-                    comparison = session.look()
-                    if comparison is not None:
-                        session.write(journal, comparison)
-                    needed = session.needed(comparison)
-                    if not needed:
-                        break
-                    session.train(needed)
-            except BaseException:
-                journal.status("KILLED")
-                raise
+            while True:
+                comparison = session.look()
+                if comparison is not None:
+                    session.write(journal, comparison)
+                needed = session.needed(comparison)
+                if not needed:
+                    break
+                session.train(needed)
             journal.finish()
-    except (SystemExit, KeyboardInterrupt):
-        print(f"atlantis_exp: the decision goes on with: {request.command}", file=sys.stderr)
-        raise
+        except (SystemExit, KeyboardInterrupt) as ended:
+            journal.status("KILLED")
+            print(f"atlantis_exp: the decision goes on with: {request.command}", file=sys.stderr)
+            sys.exit(ended.code if isinstance(ended, SystemExit) else 130)
+        except BaseException as error:
+            is_late = isinstance(error, Fault) and error.exit_code == 124
+            journal.status("KILLED" if is_late else "FAILED", str(error))
+            raise
+    print(f"its runs again: {session.comparing}")
 
 
 @dataclass(frozen=True)
@@ -94,24 +96,36 @@ class _Session:
 
     request: Request
     contenders: Mapping[str, tuple[tuple[str, ...], Job]]  # by the labels that a comparison gives their groups
+    asked: Sequence[Family]  # without seeds
     folder: RunFolder
 
     @classmethod
     def of(cls, request: Request) -> "_Session":
-        contenders: dict[str, tuple[tuple[str, ...], Job]] = {}
-        for chosen in request.contenders:
-            job = request.job_of([*request.fixed, *chosen])
-            label = " ".join(values_in(flatten(to_dict(job.config)), request.question.by))
-            if label in contenders:
-                raise ConfigError(f"{' '.join(chosen)}: the same contender as {' '.join(contenders[label][0])}")
-            contenders[label] = chosen, job
         question = request.question
-        if question.baseline is not None and not any(question.baseline in label.split() for label in contenders):
-            raise ConfigError(f"baseline={question.baseline}: none of the contenders {', '.join(contenders)}")
-        _, first = next(iter(contenders.values()))
-        identity = {"several": list(request.several), "fixed": sorted(request.fixed), **vars(question)}
-        folder = RunFolder(first.outputs / "decisions" / f"decide-{digest(identity)}")
-        return cls(request, contenders, folder)
+        contenders: dict[str, tuple[tuple[str, ...], Job]] = {}
+        groups = []
+        for chosen in request.contenders:
+            job = request.job_of((*request.fixed, *chosen))
+            facts = flatten(to_dict(job.config))
+            if unknown := [key for key in question.by if not resolve(key, facts)]:
+                raise ConfigError(
+                    f"{unknown[0]}: is no single key; name those that differ, as in objective=dqn,quantile"
+                )
+            group = Group(values_in(facts, question.by), {})
+            if group.label in contenders:
+                raise ConfigError(f"{' '.join(chosen)}: the same contender as {' '.join(contenders[group.label][0])}")
+            contenders[group.label] = chosen, job
+            groups.append(group)
+        asked = families(groups, question)
+        config = next(iter(contenders.values()))[1].config
+        session = cls(request, contenders, asked, RunFolder(Path(config.paths.outputs)))
+        identity = {
+            **vars(question),
+            "runs": sorted(folder.name for folder in session.runs),
+            "budget.steps": config.budget.steps,
+            "evaluation.epsilon": config.evaluation.epsilon,
+        }
+        return replace(session, folder=RunFolder(session.folder.path / "decisions" / f"decide-{digest(identity)}"))
 
     @property
     def outputs(self) -> Path:
@@ -131,39 +145,64 @@ class _Session:
         return looks_up_to(self.request.question.seeds)
 
     @property
-    def names(self) -> list[str]:
+    def runs(self) -> list[RunFolder]:
         """The runs that may belong to the answer."""
         seeds = range(_SPARE * self.request.question.seeds)
-        return [self.job(label, seed).config.run_name() for label in self.contenders for seed in seeds]
+        return [RunFolder.of(self.job(label, seed).config) for label in self.contenders for seed in seeds]
+
+    @property
+    def comparing(self) -> str:
+        """The command that compares the runs as they have been here, which spends no error and finds nothing else."""
+        question = self.request.question
+        delta = f"{question.delta:.12g}" if question.delta is not None else ""
+        if question.delta is not None and question.relative:
+            delta = f"{100 * question.delta:.12g}%"
+        return command_line(
+            *("compare", f"by={','.join(question.by)}", f"runs={self.folder.name}", f"seeds={question.seeds}"),
+            *([f"delta={delta}"] if delta else []),
+            *([f"baseline={question.baseline}"] if question.baseline is not None else []),
+            *([f"error={question.error}"] if question.error != Question.error else []),
+            f"paths.outputs={self.outputs}",
+        )
 
     def job(self, label: str, seed: int) -> Job:
         """The training of a contender with a seed."""
         _, job = self.contenders[label]
-        overrides = (*(text for text in job.overrides if not text.startswith("seed=")), f"seed={seed}")
+        overrides = (*job.overrides, f"seed={seed}")
+        if any("${" in text for text in overrides):  # a value may follow from the seed; else composing is slow
+            return self.request.job_of(overrides)
         return replace(job, config=replace(job.config, seed=seed), overrides=overrides)
 
     def done(self, label: str, seed: int) -> bool:
         """Whether that training has ended."""
-        config = self.job(label, seed).config
-        return RunFolder.of(config).ended(config.budget.steps) is not None
+        return self._has_ended(RunFolder.of(self.job(label, seed).config))
+
+    def _has_ended(self, folder: RunFolder) -> bool:
+        return folder.ended(self._first.config.budget.steps) is not None
 
     def look(self) -> Comparison | None:
         """The comparison of what is there, with the look that is due; None until all have the first look's seeds."""
+        ended = [folder.name for folder in self.runs if self._has_ended(folder)]
+        self.folder.write_config({"command": self.request.command, "runs": ended})
         if not all(self.done(label, seed) for label in self.contenders for seed in range(self.looks[0])):
             return None
         return compare(
             self.request.question,
-            runs=self.names,
+            runs=[self.folder.name],
             where=(),
             at_epsilon=None,
             look_now=False,
             tracking=self.tracking,
             paths=self._first.config.paths,
-            command=self.request.command,
+            command=self.comparing,
         )
 
     def needed(self, comparison: Comparison | None) -> dict[str, list[int]]:
-        """The seeds that each contender lacks for its next look; empty once there is none."""
+        """The seeds that each contender lacks for its next look; empty once there is none.
+
+        Raises:
+            Fault: where more seeds would not help.
+        """
         if comparison is None:
             lacking = {
                 label: [seed for seed in range(self.looks[0]) if not self.done(label, seed)]
@@ -171,107 +210,149 @@ class _Session:
             }
             return {label: seeds for label, seeds in lacking.items() if seeds}
         needed = wanted(comparison.answers)
-        most = _SPARE * self.request.question.seeds
-        if spent := sorted(label for label, seeds in needed.items() if max(seeds) >= most):
-            raise Fault(f"{spent[0]}: {most} seeds are not enough, since many play equal games; train it for longer")
+        if missing := self.contenders.keys() - set(comparison.groups):
+            needed = {label: [0] for label in missing}  # none of its runs could be compared
+        for label, seeds in needed.items():
+            if unusable := [seed for seed in seeds if self.done(label, seed)]:
+                name = self.job(label, unusable[0]).config.run_name()
+                raise Fault(f"run {name} has ended and cannot be compared; above it says why")
+            most = _SPARE * self.request.question.seeds
+            if max(seeds) >= most:
+                raise Fault(f"{label}: {most} seeds are not enough, for many play equal games; train it for longer")
         return needed
 
     def train(self, needed: Mapping[str, Sequence[int]]) -> None:
-        """Train seeds of contenders, all contenders' first seed before their second ones."""
-        if not self.request.launcher:
-            order = sorted({seed for seeds in needed.values() for seed in seeds})
-            jobs = [self.job(label, seed) for seed in order for label, seeds in needed.items() if seed in seeds]
-            with ledger(jobs, self.request.several, command=self.request.command):
-                for job in jobs:
-                    train(job)
-            return
-        shared = {tuple(seeds) for seeds in needed.values()}
-        if len(shared) == 1 and needed.keys() == self.contenders.keys():
-            self._launch(shared.pop(), self.request.several)
-            return
-        for label, seeds in needed.items():
-            self._launch(seeds, self.contenders[label][0])
+        """Train seeds of contenders, all contenders' first seed before their second ones. Raises: Fault."""
+        try:
+            if not self.request.launcher:
+                order = sorted({seed for seeds in needed.values() for seed in seeds})
+                jobs = [self.job(label, seed) for seed in order for label, seeds in needed.items() if seed in seeds]
+                with ledger(jobs, self.request.several, command=self.request.command):
+                    for job in jobs:
+                        if (late := train(job)) is not None:
+                            sys.exit(128 + late)
+            elif len(set(map(tuple, needed.values()))) == 1 and needed.keys() == self.contenders.keys():
+                self._launch(next(iter(needed.values())), self.request.several)
+            else:
+                for label, seeds in needed.items():
+                    self._launch(seeds, self.contenders[label][0])
+            for label, seeds in needed.items():
+                if left := [seed for seed in seeds if not self.done(label, seed)]:
+                    raise Fault(f"run {self.job(label, left[0]).config.run_name()} has not ended")
+        except Fault as fault:
+            raise Fault(f"{fault}; the decision goes on with: {self.request.command}", fault.exit_code) from fault
 
     def _launch(self, seeds: Sequence[int], chosen: Sequence[str]) -> None:
         """Run a sweep by the launcher that was asked for. Raises: Fault."""
-        overrides = [f"seed={','.join(map(str, seeds))}", *chosen, *self.request.fixed]
+        overrides = [f"seed={','.join(map(str, seeds))}", *self.request.fixed, *chosen]
         command = [sys.executable, "-m", "atlantis_exp", "train", "-m", *self.request.launcher, *overrides]
-        if code := subprocess.run(command, check=False).returncode:
-            raise Fault(
-                f"a sweep of the decision ended with exit code {code}; it goes on with: {self.request.command}",
-                exit_code=code if code > 0 else 128 - code,
-            )
+        with subprocess.Popen(command) as sweep:
+            try:
+                code = sweep.wait()
+            except BaseException:
+                sweep.terminate()  # which has its jobs commit, and is waited for
+                raise
+        if code:
+            raise Fault(f"a sweep ended with exit code {code}", exit_code=code if code > 0 else 128 - code)
 
     def say_what_it_takes(self) -> None:
         """Print how many runs there may be, the hours that they take here, and what difference they can find."""
-        console = Console(highlight=False, soft_wrap=True)
-        looks, question = self.looks, self.request.question
-        at = " and ".join(map(str, looks))
+        console = terminal.console()
+
+        def say(text: str) -> None:
+            console.print(text)
+
+        looks, count = self.looks, len(self.contenders)
         missing = {label: sum(not self.done(label, seed) for seed in range(looks[-1])) for label in self.contenders}
-        there = len(self.contenders) * looks[-1] - sum(missing.values())
-        console.print(
-            f"{', '.join(self.contenders)}: looks at {at} seeds each, {len(self.contenders) * looks[0]} to "
-            f"{len(self.contenders) * looks[-1]} runs, of which {there} are there",
-            markup=False,
+        fewest = f"{count * looks[0]} to " if len(looks) > 1 else ""
+        say(
+            f"{', '.join(self.contenders)}: {fewest}{count * looks[-1]} runs, looks at "
+            f"{' and '.join(map(str, looks))} seeds each; {count * looks[-1] - sum(missing.values())} are there. "
+            f"Seeds that play equal games count as one, and others take their place."
         )
         hours = 0.0
         for label, runs in missing.items():
-            if runs == 0:
-                continue
-            job = self.job(label, 0)
-            with tempfile.TemporaryDirectory() as aside:
-                trainer = build_trainer(job.config, Path(aside), NullJournal(), Progress(Console(quiet=True)))
-                with trainer.emulators:
-                    forecast = expected(trainer, job.config, 0)
-            hours += runs * forecast.hours
-            console.print(f"{label}: {forecast.hours:,.2f} hours a run, one alone on this machine", markup=False)
+            if runs and self._first.config.budget.forecast != "off":
+                forecast = self._forecast(label)
+                hours += runs * forecast
+                say(f"{label}: {duration(forecast)} a run, alone on this machine")
         if hours:
-            console.print(f"at most {hours:,.1f} hours if they run one after the other, evaluations not counted")
+            say(f"at most {duration(hours)} where they run one after the other, evaluations not counted")
         spread, whence = self._spread()
-        family = (
-            len(self.contenders) - 1 if question.baseline else len(self.contenders) * (len(self.contenders) - 1) // 2
-        )
-        reach = detectable(Plan(looks, question.error), spread, family)
-        console.print(
-            f"a difference of {reach:.0%} of the score is found with 80 % at {looks[-1]} seeds, "
-            f"if seeds differ as {whence}",
-            markup=False,
-        )
+        for family in self.asked:
+            pairs = len(family.plan.pairs(family.seeds))
+            averaged = spread / sqrt(min(map(len, family.groups.values())))
+            words = "a difference" if len(self.asked) == 1 else f"by {family.name}, a difference"
+            words += f" of {100 * detectable(family.plan, averaged, pairs):.0f} % of the score is found"
+            if family.plan.delta is not None:
+                least = 100 * equivalence(family.plan, averaged, pairs)
+                words += f", and no difference where delta is {least:.0f} % or more,"
+            say(f"{words} with 80 % at {looks[-1]} seeds")
+        say(f"(if a contender's seeds differ as {whence}: {100 * spread:.0f} % of their mean, standard deviation)")
+
+    def _forecast(self, label: str) -> float:
+        """The hours that a contender's training takes here."""
+        config = self.job(label, 0).config
+        with tempfile.TemporaryDirectory() as aside:
+            trainer = build_trainer(config, Path(aside), NullJournal(), Progress(Console(quiet=True)))
+            with trainer.emulators:
+                return expected(trainer, config, 0).hours
 
     def _spread(self) -> tuple[float, str]:
         """The standard deviation over seeds as a share of the score, and where that is known from."""
         shares = []
         for label in self.contenders:
             ended = [RunFolder.of(self.job(label, seed).config).result for seed in range(self.looks[-1])]
-            scores = [
+            scores = {
                 result.evaluation["evaluation/interquartile_mean"] for result in ended if result and result.evaluation
-            ]
-            if len(scores) > 2 and np.mean(scores) > 0:
-                shares.append(float(np.std(scores, ddof=1) / np.mean(scores)))
+            }
+            if len(scores) > 2 and np.mean(list(scores)) > 0:
+                shares.append(float(np.std(list(scores), ddof=1) / np.mean(list(scores))))
         if shares:
             return float(np.mean(shares)), "those that are there do"
         rows = [row for row in literature("curves") if row["mean"] > 0]
         # Of five seeds the range is 2.326 standard deviations on average.
         published = [(row["high"] - row["low"]) / 2.326 / row["mean"] for row in rows]
-        return float(np.median(published)), "published ones do (Dopamine, five seeds)"
+        return float(np.median(published)), "published ones do (Dopamine's DQN, five seeds)"
 
     def write(self, journal: Journal, comparison: Comparison) -> None:
-        """Write the looks, what they spent and what they found to the decision's page."""
-        lines = [comparison.verdict, *comparison.others, *comparison.beside]
+        """Write the looks that the page does not have yet, what they spent, and what is known now."""
+        there = {
+            (record.step, key)
+            for _, record in read(self.folder.path)
+            if isinstance(record, Metrics)
+            for key in record.values
+        }
         for answer in comparison.answers:
-            decision = answer.decision
-            for look in decision.looks:
+            spent = 0.0
+            for look in answer.decision.looks:
+                spent += look.error
+                values = {f"error_spent/{answer.family.name}": spent}
                 for verdict in look.verdicts:
-                    pair = f"{verdict.group} over {verdict.other}"
-                    measures = {"difference": verdict.difference, "low": verdict.low, "high": verdict.high}
-                    journal.metrics(
-                        {_metric(f"{name}/{answer.family.name}/{pair}"): value for name, value in measures.items()},
-                        look.size,
-                    )
-            journal.metrics({_metric(f"error_spent/{answer.family.name}"): decision.spent}, len(decision.looks))
+                    pair = f"{answer.family.name}/{verdict.group} over {verdict.other}"
+                    values |= {f"difference/{pair}": verdict.difference}
+                    values |= {f"low/{pair}": verdict.low, f"high/{pair}": verdict.high}
+                named = {_metric(name): value for name, value in values.items()}
+                if new := {key: value for key, value in named.items() if (look.size, key) not in there}:
+                    journal.metrics(new, look.size)
         journal.tags({"verdict": comparison.verdict})
-        journal.note("\n\n".join([*lines, f"Continue or report: `{self.request.command}`"]))
+        lines = [comparison.verdict, *comparison.others, *comparison.beside, _looks(comparison)]
+        commands = f"Continue or report: `{self.request.command}`\n\nIts runs again: `{self.comparing}`"
+        journal.note("\n\n".join(line for line in (*lines, commands) if line))
         journal.flush()
+
+
+def _looks(comparison: Comparison) -> str:
+    """The looks that were taken, as a table for MLflow's page; empty before the first."""
+    rows = [
+        f"| {look.size} | {verdict.group} over {verdict.other} | {verdict.said} | {verdict.difference:,.0f} "
+        f"| {verdict.low:,.0f} to {verdict.high:,.0f} | {look.error:.2%} |"
+        for answer in comparison.answers
+        for look in answer.decision.looks
+        for verdict in look.verdicts
+    ]
+    head = ["| look at seeds | pair | said | difference | interval | error spent |", f"|{' --- |' * 6}"]
+    return "\n".join([*head, *rows]) if rows else ""
 
 
 def _metric(name: str) -> str:

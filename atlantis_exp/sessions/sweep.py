@@ -86,7 +86,7 @@ def _page(
     if not launcher.is_basic:
         catch_up(outputs)  # the jobs do not
     others = () if launcher.is_basic else folders
-    with sweep.held(), _terminable():
+    with sweep.held(), terminable():
         for folder in folders:
             with suppress(Fault), folder.held():  # what runs elsewhere stays where it is
                 adopt(folder.path, sweep.path)
@@ -168,7 +168,7 @@ def _every(seconds: float, look: Callable[[], None]) -> Iterator[Callable[[], No
 
 
 @contextmanager
-def _terminable() -> Iterator[None]:
+def terminable() -> Iterator[None]:
     """SIGTERM between two runs ends the process as an exception does; a run listens for itself."""
 
     def end(number: int, _: FrameType | None) -> NoReturn:

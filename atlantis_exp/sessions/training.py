@@ -24,18 +24,20 @@ from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Outcome, Trainer
 
 
-def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> None:
+def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int | None:
     """Start the run that a job is, continue it, or print its result if it has ended.
 
     As a job of a sweep that another process runs, it writes the run's folder only: that process publishes it.
 
     watch: asked after every step; where it says so, the run is committed and left to be continued.
+
+    Returns the signal that came too late to stop it, None where none did: whoever has more to train stops now.
     """
     config, folder = job.config, RunFolder.of(job.config)
     if folder.status != "SCHEDULED":  # where a sweep has, its failure is to be recorded
         choose_device(config.device)  # before anything is put aside or written
     if _has_ended(job, folder):
-        return
+        return None
     progress = Progress()
     stop = StopRequest(config.budget.seconds, sweep_goes_on(folder, job.launcher))
     tracking = config.tracking if job.launcher is None else dataclasses.replace(config.tracking, name="none")
@@ -58,6 +60,7 @@ def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> None:
         print(f"\n{result.report}\n\nrun {folder.name}: {steps} steps, {trainer.counters.seconds:,.0f} s")
     elif stop():
         stop.end(f"run {folder.name} is committed at step {steps}; continue with: {job.command}")
+    return stop.signal
 
 
 def _has_ended(job: Job, folder: RunFolder) -> bool:

@@ -36,7 +36,7 @@ class Forecast:
 
     def __str__(self) -> str:
         return (
-            f"expect about {self.steps_per_second:,.0f} steps/s, {_hours(self.hours)} for {self.steps:,} steps, "
+            f"expect about {self.steps_per_second:,.0f} steps/s, {duration(self.hours)} for {self.steps:,} steps, "
             f"{_size(self.memory)} of memory ({_size(self.memory_available)} available), "
             f"{_size(self.disk)} of disk ({_size(self.disk_available)} free)"
         )
@@ -135,5 +135,6 @@ def _size(count: float) -> str:
     return f"{count / 2**30:,.1f} GiB" if count >= 2**30 else f"{count / 2**20:,.0f} MiB"
 
 
-def _hours(hours: float) -> str:
+def duration(hours: float) -> str:
+    """Hours as a person reads them, in minutes where they are less than one."""
     return f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:,.0f} minutes"

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import mlflow
+import pyarrow.parquet as pq
 import pytest
 
 from atlantis_exp.commands.compare import VERB
@@ -35,8 +36,19 @@ def test_a_comparison_is_a_page_figures_and_tables_in_a_folder_and_in_the_store(
     assert path.is_relative_to(tmp_path / "comparisons")
     assert "resnet plays better than cnn" in path.read_text()
     assert len(list((path.parent / "figures").glob("*.png"))) == 10
+    tables = {file.name for file in (path.parent / "tables").iterdir()}
+    names = {"scores", "seeds", "verdict", "plan", "looks", "evaluation", "runs", "views", "skipped"}
+    assert tables >= {f"{name}.{kind}" for name in names for kind in ("csv", "tex", "parquet")}
+    assert len(tables) == 3 * len({name.partition(".")[0] for name in tables})
     with open(path.parent / "tables" / "runs.csv") as file:
-        assert len(list(csv.DictReader(file))) == 10
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 10
+    stored_rows = pq.read_table(path.parent / "tables" / "runs.parquet").to_pylist()
+    assert stored_rows[0].keys() == rows[0].keys()
+    assert [row["score (points)"] for row in stored_rows] == [float(row["score (points)"]) for row in rows]
+    latex = (path.parent / "tables" / "verdict.tex").read_text()
+    assert r"\toprule" in latex
+    assert "difference (points)" in latex
 
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path}/mlflow.db")
     experiment = client.get_experiment_by_name("atlantis")
@@ -102,12 +114,14 @@ def test_a_real_training_can_be_compared(
         runs = list(csv.DictReader(file))
     for row in runs:
         result = json.loads((tmp_path / "runs" / row["run"] / "result.json").read_bytes())
-        assert float(row["mean"]) == result["evaluation"]["evaluation/mean"]
-        assert float(row["score"]) == result["evaluation"]["evaluation/interquartile_mean"]
+        assert float(row["mean (points)"]) == result["evaluation"]["evaluation/mean"]
+        assert float(row["score (points)"]) == result["evaluation"]["evaluation/interquartile_mean"]
         assert float(row["frames"]) == result["counts"]["frames"]
         assert float(row["flops"]) > 0
     with open(page.parent / "tables" / "actions.csv") as file:
         shares = [
-            float(row["network"]) + float(row["random"]) for row in csv.DictReader(file) if row["group"] == "seed=0"
+            float(row["network (fraction)"]) + float(row["random (fraction)"])
+            for row in csv.DictReader(file)
+            if row["group"] == "seed=0"
         ]
     assert sum(shares) == pytest.approx(1)

@@ -205,7 +205,7 @@ def test_all_tables_of_a_comparison_become_latex_and_parquet(tables: dict[str, T
 
 
 def test_every_number_of_a_comparison_has_a_unit_or_a_name_that_says_what_it_counts(tables: dict[str, Table]) -> None:
-    counts = {"runs", "episodes", "episode", "seed", "seeds", "epsilon", "truncated", "at", "x", "decided"}
+    counts = {"runs", "episodes", "episode", "seed", "look", "epsilon", "truncated", "at", "x", "decided"}
     numbers = {
         key
         for table in tables.values()

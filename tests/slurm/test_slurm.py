@@ -1,5 +1,6 @@
 """Sweeps on a real Slurm, which preempts, requeues, times out and cancels their jobs."""
 
+import json
 import os
 import re
 import shutil
@@ -197,3 +198,23 @@ def test_jobs_that_are_preempted_requeued_timed_out_or_cancelled_end_as_the_unbr
     )
     assert compared.returncode == 0, compared.stderr
     assert "cnn" in compared.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)  # seconds
+def test_a_decision_has_slurm_train_what_it_needs(
+    tiny_overrides: tuple[str, ...], slurm: dict[str, str], tmp_path: Path
+) -> None:
+    chosen = (
+        *("env.max_steps=100,900", "seeds=5", "phase.quick.steps=40", "training.learn_every=10"),
+        *("evaluation.every_steps=null", "evaluation.epsilon=0.5", "evaluation.seed=${seed}", "evaluation.episodes=4"),
+    )
+    words = (*tiny_overrides, *chosen, f"paths.outputs={tmp_path}", *LAUNCHER)
+    decided = subprocess.run(
+        (*COMMAND, "decide", *words), cwd=REPOSITORY, env=slurm, capture_output=True, text=True, check=False
+    )
+    assert decided.returncode == 0, decided.stdout + decided.stderr
+    assert "max_steps=900 plays better than max_steps=100 by" in decided.stdout
+    seeds = sorted(json.loads(path.read_bytes())["seed"] for path in tmp_path.glob("runs/*/config.json"))
+    assert seeds == sorted(2 * list(range(5)))
+    assert len(list(tmp_path.glob("sweeps/*/*/*.out"))) == 10

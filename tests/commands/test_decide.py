@@ -1,0 +1,54 @@
+"""The verb decide: what it refuses before anything is written, each in one line."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+Command = Callable[..., int]
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (("model=cnn",), "nothing to decide between: give a key several values, as in model=cnn,resnet_fast"),
+        (("model=choice(cnn)",), "nothing to decide between: give a key several values, as in model=cnn,resnet_fast"),
+        (("-m", "model=cnn,resnet"), "-m: decide plans its own sweeps; drop -m"),
+        (("--multirun", "model=cnn,resnet"), "-m: decide plans its own sweeps; drop -m"),
+        (("model=cnn,resnet", "seed=3"), "seed=3: decide trains seeds from 0 on, as many as it needs; drop it"),
+        (("model=cnn,resnet", "seed=0,1"), "seed=0,1: decide trains seeds from 0 on, as many as it needs; drop it"),
+        (("model=cnn,resnet", "resume=never"), "resume=never: decide goes on with the runs that are there; drop it"),
+        (
+            ("budget.steps=100,200",),
+            "budget.steps: says how contenders are trained or measured, not what they are; one value only",
+        ),
+        (("model=cnn,resnet", "seeds=5,10"), "seeds: says how contenders are trained or measured, not what they are"),
+        (("experiment=fast,quick",), "experiment: a preset is no single key; name those that differ"),
+        (("phase=single,two_phase",), "phase: is no single key; name those that differ"),
+        (("optimizer.lr=interval(0,1)",), "optimizer.lr=interval(0,1): no list of values; write them out"),
+        (("model=cnn,rsenet",), "model=rsenet: no such option in conf/model; did you mean 'resnet'?"),
+        (("optimizer.lr=0.001,1e-3",), "optimizer.lr=0.001: the same contender as optimizer.lr=0.001"),
+        (("model=cnn,resnet", "baseline=resnte"), "baseline=resnte: no such group; did you mean 'resnet'?"),
+        (("model=cnn,resnet", "delta=5pt"), "delta=5pt: write a share of a score, as in delta=5%, or points"),
+        (("model=cnn,resnet", "seeds=4"), "seeds=4: should be greater than or equal to 5"),
+        (("model=cnn,resnet", "error=0"), "error=0: should be greater than 0"),
+        (("model=cnn,resnet", "look=now"), "look=now: no such key"),
+        (("model=cnn,resnet", "evaluation.at_end=false"), "evaluation.at_end=false: contenders are compared by the "),
+        (("model=cnn,resnet", "hydra/launcher=joblb"), "In 'hydra/config': Could not find 'hydra/launcher/joblb'"),
+    ],
+)
+def test_a_question_that_cannot_be_decided_is_one_line_and_code_2_and_leaves_nothing_behind(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], line: str
+) -> None:
+    assert command("decide", *words, f"paths.outputs={tmp_path / 'o'}") == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"atlantis_exp: {line}")
+    assert error.count("\n") == 1
+    assert not (tmp_path / "o").exists()
+
+
+def test_help_says_what_decide_takes(command: Command, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command("decide", "--help") == 0
+    shown = capsys.readouterr().out
+    for word in ("model", "baseline", "delta", "seeds", "error"):
+        assert word in shown

@@ -1,0 +1,334 @@
+"""Decisions with real trainings: which seeds are trained and when, when it stops, and what is said."""
+
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import mlflow
+import pytest
+
+from atlantis_exp.commands.app import Asked
+from atlantis_exp.commands.compare import VERB as COMPARE
+from atlantis_exp.commands.decide import DecideConfig, request_of
+from atlantis_exp.commands.overrides import check, swept
+from atlantis_exp.config import Config
+from atlantis_exp.faults import Fault
+from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.runs.journal import read_commit
+from atlantis_exp.sessions.deciding import _Session, decide
+from atlantis_exp.tracking.publishing import catch_up
+
+REPOSITORY = Path(__file__).parents[2]
+# Networks so young hold one action: seeds differ since each plays other games, with half of the decisions random.
+SHORT = (
+    *("phase.quick.steps=40", "training.learn_every=10", "evaluation.every_steps=null"),
+    *("evaluation.epsilon=0.5", "evaluation.seed=${seed}", "evaluation.episodes=4", "seeds=5"),
+)
+CAPS = "env.max_steps=100,900"  # who plays longer scores more
+
+Compose = Callable[..., Config]
+Recorded = Callable[..., Path]
+Asking = Callable[..., _Session]
+
+
+@pytest.fixture
+def asking(tiny_overrides: tuple[str, ...], tmp_path: Path) -> Asking:
+    """A decision as a command line asks for it: `asking("model=cnn,resnet")`."""
+
+    def asked(*words: str) -> _Session:
+        typed = (*tiny_overrides, f"paths.outputs={tmp_path}", *words)
+        several = swept(typed)
+        ((texts, config),) = check("decide", DecideConfig, [text for text in typed if text not in several]).items()
+        return _Session.of(request_of(Asked(config, "decide", texts, typed=typed)))
+
+    return asked
+
+
+@pytest.fixture
+def deciding(tiny_overrides: tuple[str, ...], tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
+    """Starts a decision as a shell does."""
+
+    def start(*words: str, env: dict[str, str] | None = None) -> subprocess.Popen[str]:
+        overrides = (*tiny_overrides, *SHORT, f"paths.outputs={tmp_path / 'o'}", *words)
+        return subprocess.Popen(
+            (sys.executable, "-m", "atlantis_exp", "decide", *overrides),
+            cwd=REPOSITORY,
+            env=env,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    return start
+
+
+def seeds_of(session: _Session, label: str, most: int = 20) -> list[int]:
+    """The seeds of a contender whose runs have ended."""
+    return [seed for seed in range(most) if session.done(label, seed)]
+
+
+def looks(outputs: Path) -> dict[str, list[dict[str, object]]]:
+    (path,) = outputs.glob("comparisons/*/looks.json")
+    found: dict[str, list[dict[str, object]]] = json.loads(path.read_bytes())
+    return found
+
+
+def record_seeds(recorded: Recorded, first: float, seeds: range, *overrides: str) -> None:
+    """Finished trainings with scores about `first`, a few points apart."""
+    for seed in seeds:
+        score = first + 7 * (seed % 3) + seed
+        recorded(*overrides, f"seed={seed}", scores=(score, score + 1, score + 2, score + 3))
+
+
+@pytest.mark.slow
+def test_contenders_are_trained_level_until_a_look_decides_and_compare_says_the_same(
+    asking: Asking, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = asking(*SHORT, CAPS)
+    decide(session.request)
+    printed = capsys.readouterr().out
+    labels = ["max_steps=100", "max_steps=900"]
+    folders = [RunFolder.of(session.job(label, seed).config) for seed in range(5) for label in labels]
+    assert {path.name for path in (tmp_path / "runs").iterdir()} == {folder.name for folder in folders}
+    began = {folder.name: (folder.path / "result.json").stat().st_mtime_ns for folder in folders}
+    assert list(began) == sorted(began, key=began.__getitem__)  # seed 0 of both, seed 1 of both, ...
+    assert folders[2].config["evaluation"]["seed"] == 1
+    answer = next(line for line in printed.splitlines() if line.startswith("max_steps=900 plays better than"))
+    before = looks(tmp_path)
+    assert [look["error"] for look in before["env.max_steps"]] == [0.05]
+
+    again = shlex.split(session.comparing)
+    assert f"its runs again: {session.comparing}" in printed
+    assert again[:4] == ["python", "-m", "atlantis_exp", "compare"]
+    COMPARE.run([*again[4:], "tracking=none"])
+    assert answer in capsys.readouterr().out.splitlines()
+    assert looks(tmp_path) == before
+    decide(session.request)
+    assert answer in capsys.readouterr().out.splitlines()
+    assert looks(tmp_path) == before
+    assert {name: (tmp_path / "runs" / name / "result.json").stat().st_mtime_ns for name in began} == began
+
+
+def test_decided_pairs_are_dropped_and_the_page_in_mlflow_has_each_look_once(
+    asking: Asking, recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rates = {"lr=0.001": 9_000.0, "lr=0.002": 1_000.0, "lr=0.003": 1_000.0}
+    for label, score in rates.items():
+        # Of those that are alike, nine of the ten seeds of the last look are there.
+        record_seeds(recorded, score, range(5 if score > 5_000 else 9), f"optimizer.{label}")
+    session = asking("optimizer.lr=0.001,0.002,0.003", "tracking=mlflow")
+    assert list(session.contenders) == list(rates)
+    decide(session.request)
+    printed = " ".join(capsys.readouterr().out.split())
+    assert [len(seeds_of(session, label)) for label in rates] == [5, 10, 10]
+    assert [look["error"] for look in looks(tmp_path)["optimizer.lr"]] == [0.0125, pytest.approx(0.0375)]
+    assert "lr=0.001 plays better than lr=0.002 by" in printed
+    assert "Not decided: lr=0.002 against lr=0.003" in printed
+
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path}/mlflow.db")
+    experiment = client.get_experiment_by_name("atlantis")
+    assert experiment is not None
+
+    def page() -> dict[str, list[tuple[int, float]]]:
+        catch_up(tmp_path)  # a busy machine may not have sent all of it in time
+        (run,) = client.search_runs([experiment.experiment_id], "tags.`atlantis.kind` = 'decision'")
+        assert run.info.status == "FINISHED"
+        assert run.data.tags["verdict"].startswith("lr=0.001 plays better than lr=0.002")
+        assert "| 5 | lr=0.001 over lr=0.002 | better |" in run.data.tags["mlflow.note.content"]
+        assert session.comparing in run.data.tags["mlflow.note.content"]
+        return {
+            key: [(point.step, point.value) for point in client.get_metric_history(run.info.run_id, key)]
+            for key in run.data.metrics
+        }
+
+    first = page()
+    assert [step for step, _ in first["error_spent/optimizer.lr"]] == [5, 10]
+    assert [spent for _, spent in first["error_spent/optimizer.lr"]] == pytest.approx([0.0125, 0.05])
+    assert [step for step, _ in first["difference/optimizer.lr/lr_0.001 over lr_0.002"]] == [5]
+    pair = "optimizer.lr/lr_0.002 over lr_0.003"
+    assert [step for step, _ in first[f"difference/{pair}"]] == [5, 10]
+    for (_, low), (_, difference), (_, high) in zip(
+        *(first[f"{name}/{pair}"] for name in ("low", "difference", "high")), strict=True
+    ):
+        assert low < difference < high
+    decide(session.request)
+    assert page() == first
+
+
+def test_seeds_that_are_there_are_looked_at_without_a_training(
+    asking: Asking, recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for label, score in (("0.001", 9_000.0), ("0.002", 1_000.0), ("0.003", 1_000.0)):
+        record_seeds(recorded, score, range(5 if score > 5_000 else 10), f"optimizer.lr={label}")
+    before = set((tmp_path / "runs").iterdir())
+    session = asking("optimizer.lr=0.001,0.002,0.003")
+    decide(session.request)
+    assert [len(look["seeds"]) for look in looks(tmp_path)["optimizer.lr"]] == [3, 2]  # type: ignore[arg-type]
+    assert "would have been found with 80 %" in " ".join(capsys.readouterr().out.split())
+    assert set((tmp_path / "runs").iterdir()) == before
+
+
+def test_seeds_that_play_equal_games_end_in_one_line(asking: Asking, recorded: Recorded) -> None:
+    record_seeds(recorded, 1_000, range(10), "model=cnn")
+    for seed in range(10):
+        recorded("model=resnet", f"seed={seed}")
+    session = asking("model=cnn,resnet", "seeds=5")
+    with pytest.raises(
+        Fault, match=r"^resnet: 10 seeds are not enough, for many play equal games; train it for longer$"
+    ):
+        decide(session.request)
+    assert session.folder.status == "FAILED"
+
+
+def test_a_run_that_cannot_be_compared_is_named(asking: Asking, recorded: Recorded) -> None:
+    record_seeds(recorded, 1_000, range(5), "model=cnn")
+    record_seeds(recorded, 2_000, range(5), "model=resnet")
+    session = asking("model=cnn,resnet", "seeds=5")
+    run = RunFolder.of(session.job("resnet", 3).config)
+    (table,) = run.path.glob("artifacts/evaluation/*.csv")
+    table.unlink()
+    with pytest.raises(Fault, match=f"^run {run.name} has ended and cannot be compared; above it says why$"):
+        decide(session.request)
+
+
+def test_a_training_that_fails_ends_the_decision_in_one_line_that_says_how_it_goes_on(
+    asking: Asking, recorded: Recorded
+) -> None:
+    record_seeds(recorded, 1_000, range(5), "model=cnn")
+    record_seeds(recorded, 2_000, range(4), "model=resnet")
+    session = asking("model=cnn,resnet", "seeds=5")
+    run = RunFolder.of(session.job("resnet", 4).config)
+    run.path.mkdir(parents=True)
+    (run.path / "checkpoints").write_text("in the way")
+    with pytest.raises(Fault) as failed:
+        decide(session.request)
+    assert str(failed.value).startswith(f"run {run.name}: ")
+    assert str(failed.value).endswith(f"; the decision goes on with: {session.request.command}")
+    assert session.folder.status == "FAILED"
+
+
+def test_the_same_question_is_the_same_decision_however_it_is_written(asking: Asking) -> None:
+    one = asking("optimizer.lr=0.001,0.002", "budget.steps=1_000_000")
+    for line in (
+        "optimizer.lr=0.002,1e-3 budget.steps=1000000",
+        "optimizer.lr=0.001,0.002 budget.steps=1_000_000 threads=2 tracking=mlflow",
+    ):
+        assert asking(*line.split()).folder == one.folder
+    for line in ("budget.steps=2_000_000", "budget.steps=1_000_000 seeds=20", "budget.steps=1_000_000 delta=5%"):
+        assert asking("optimizer.lr=0.001,0.002", *line.split()).folder != one.folder
+
+
+def said(session: _Session, capsys: pytest.CaptureFixture[str]) -> str:
+    session.say_what_it_takes()
+    return capsys.readouterr().out
+
+
+def test_before_it_starts_it_says_runs_hours_and_what_it_can_find(
+    asking: Asking, recorded: Recorded, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shown = said(asking("model=cnn,resnet_fast", "budget.forecast=warn"), capsys)
+    assert "cnn, resnet_fast: 10 to 20 runs, looks at 5 and 10 seeds each; 0 are there." in shown
+    assert "cnn: 0 minutes a run, alone on this machine" in shown
+    assert "resnet_fast: 0 minutes a run, alone on this machine" in shown
+    assert "at most 0 minutes where they run one after the other" in shown
+    assert "\na difference of 12 % of the score is found with 80 % at 10 seeds\n" in shown
+    assert "published ones do (Dopamine's DQN, five seeds)" in shown
+
+    record_seeds(recorded, 1_000, range(2), "model=cnn")
+    assert "published" in said(asking("model=cnn,resnet_fast"), capsys)
+    for seed, score in ((2, 900.0), (3, 1_100.0)):
+        recorded("model=cnn", f"seed={seed}", scores=(score, score, score, score))
+    shown = said(asking("model=cnn,resnet_fast"), capsys)
+    assert "; 4 are there." in shown
+    assert "if a contender's seeds differ as those that are there do: 8 % of their mean" in shown
+    assert "a difference of 11 % of the score is found with 80 % at 10 seeds" in shown
+
+    shown = said(asking("model=cnn,resnet_fast", "delta=5%"), capsys)
+    assert "is found, and no difference where delta is 13 % or more, with 80 % at 10 seeds" in shown
+    shown = said(asking("model=cnn,resnet_fast", "sampler=uniform,top_half"), capsys)
+    assert "by model, a difference of " in shown
+    assert "by model,sampler, a difference of " in shown
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)  # seconds
+def test_a_decision_that_was_killed_goes_on_and_ends_as_the_unbroken_one(
+    deciding: Callable[..., subprocess.Popen[str]], asking: Asking, tmp_path: Path
+) -> None:
+    unbroken = asking(*SHORT, CAPS, f"paths.outputs={tmp_path / 'unbroken'}")
+    decide(unbroken.request)
+    runs = tmp_path / "o" / "runs"
+    for number, ended, sent in ((1, -9, signal.SIGKILL), (4, 130, signal.SIGINT), (7, 143, signal.SIGTERM)):
+        process = deciding(CAPS)
+        patience = time.monotonic() + 200
+        while len(list(runs.glob("*/result.json"))) < number:
+            assert process.poll() is None
+            assert time.monotonic() < patience
+            time.sleep(0.05)
+        process.send_signal(sent)
+        out, error = process.communicate()
+        assert process.returncode == ended, out + error
+        if ended > 0:
+            assert "atlantis_exp: the decision goes on with: python -m atlantis_exp decide" in error
+            assert "Traceback" not in error
+            (folder,) = (tmp_path / "o" / "decisions").iterdir()
+            assert RunFolder(folder).status == "KILLED"
+    process = deciding(CAPS)
+    out, error = process.communicate()
+    assert process.returncode == 0, error
+    assert looks(tmp_path / "o") == looks(tmp_path / "unbroken")
+    assert {path.name for path in runs.iterdir()} == {path.name for path in (tmp_path / "unbroken" / "runs").iterdir()}
+    for path in runs.glob("*/result.json"):
+        other = json.loads((tmp_path / "unbroken" / path.relative_to(tmp_path / "o")).read_bytes())
+        assert json.loads(path.read_bytes())["evaluation"] == other["evaluation"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)  # seconds
+@pytest.mark.parametrize("launcher", ["joblib", "ray"])
+def test_a_launcher_trains_what_the_decision_needs(
+    deciding: Callable[..., subprocess.Popen[str]], tmp_path: Path, launcher: str
+) -> None:
+    pytest.importorskip(f"hydra_plugins.hydra_{launcher}_launcher", reason=f"the extra {launcher} is not installed")
+    settings = {"joblib": ["hydra.launcher.n_jobs=2"], "ray": ["hydra.launcher.ray.init.num_cpus=2"]}
+    environment = {**os.environ, "RAY_USAGE_STATS_ENABLED": "0"}
+    process = deciding(CAPS, f"hydra/launcher={launcher}", *settings[launcher], "tracking=mlflow", env=environment)
+    out, error = process.communicate()
+    assert process.returncode == 0, out + error
+    assert "max_steps=900 plays better than max_steps=100 by" in out
+    assert len(list((tmp_path / "o" / "runs").glob("*/result.json"))) == 10
+    (decision,) = (tmp_path / "o" / "decisions").iterdir()
+    assert RunFolder(decision).status == "FINISHED"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)  # seconds
+def test_the_end_of_a_decision_has_its_launchers_jobs_commit(
+    deciding: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the extra joblib is not installed")
+    process = deciding(
+        *(CAPS, "phase.quick.steps=100_000", "tracking.commit_seconds=0.5"),
+        *("hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),
+    )
+    folder = tmp_path / "o" / "runs"
+    patience = time.monotonic() + 200
+    while not any(
+        (commit := read_commit(path)) is not None and commit.offset for path in folder.glob("*") if path.is_dir()
+    ):
+        assert process.poll() is None
+        assert time.monotonic() < patience
+        time.sleep(0.1)
+    process.terminate()
+    out, error = process.communicate()
+    assert process.returncode == 143, out + error
+    assert "atlantis_exp: the decision goes on with: python -m atlantis_exp decide" in error
+    runs = [RunFolder(path) for path in folder.iterdir()]
+    assert not any(run.is_held for run in runs)
+    assert {run.state for run in runs} <= {"interrupted", "missing"}
