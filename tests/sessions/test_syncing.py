@@ -424,3 +424,31 @@ def test_lists_and_files_without_end_are_refused(
     monkeypatch.setattr("atlantis_exp.tracking.store._PAGES", 5)
     with pytest.raises(ValueError, match="lists more than 5 pages"):
         list(_pages(lambda page_token: PagedList([], f"{page_token}more")))
+
+
+def test_a_redirect_to_another_server_takes_no_password_along(
+    stranger: tuple[str, list[tuple[str, str | None]]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    host, asked = stranger
+    monkeypatch.setenv("MLFLOW_TRACKING_USERNAME", "ann")
+    monkeypatch.setenv("MLFLOW_TRACKING_PASSWORD", "secret")
+    passwords: list[str | None] = []
+
+    class Redirects(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            passwords.append(self.headers["Authorization"])
+            self.send_response(307)
+            self.send_header("Location", f"http://{host}{self.path}")
+            self.end_headers()
+
+        do_POST = do_GET
+
+        def log_message(self, *_: object) -> None: ...
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Redirects) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        with pytest.raises(Fault, match="cannot be reached"):
+            synced(tmp_path, f"from=http://127.0.0.1:{server.server_address[1]}")
+        server.shutdown()
+    assert passwords[0] is not None
+    assert {password for _, password in asked} == {None}
