@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
@@ -29,6 +30,7 @@ class CompareConfig:
     seeds: Annotated[int, Field(ge=5, le=10_000)]  # a group, at the last look
     error: Annotated[float, Field(gt=0, lt=1)]  # probability of any false verdict
     look: Literal["due", "now"]
+    why: bool  # also ask the networks themselves
     tracking: TrackingConfig
     paths: PathsConfig
 
@@ -72,7 +74,11 @@ def _listed(match: re.Match[str]) -> str:
 def _work(asked: Asked[CompareConfig]) -> Callable[[], object]:
     from atlantis_exp.comparison.comparing import compare
 
-    config = asked.config
+    config, probe = asked.config, None
+    if config.why:
+        from atlantis_exp.sessions.probing import probe_groups
+
+        probe = partial(probe_groups, Path(config.paths.outputs))
     return partial(
         compare,
         config.question,
@@ -83,6 +89,7 @@ def _work(asked: Asked[CompareConfig]) -> Callable[[], object]:
         tracking=config.tracking,
         paths=config.paths,
         command=asked.command,
+        probe=probe,
     )
 
 

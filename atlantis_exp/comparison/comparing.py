@@ -2,8 +2,8 @@
 
 import re
 import sys
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import strftime
 
@@ -12,7 +12,7 @@ from rich.text import Text
 
 from atlantis_exp import terminal
 from atlantis_exp.checking import digest, flatten
-from atlantis_exp.comparison import tables
+from atlantis_exp.comparison import published, tables
 from atlantis_exp.comparison.export_tables import to_latex, to_parquet, with_units
 from atlantis_exp.comparison.figures import draw
 from atlantis_exp.comparison.gather import COMMIT, Training, gather, group, refuse_mixed_protocols, select
@@ -31,6 +31,20 @@ from atlantis_exp.tracking.publishing import publishing
 _PAGE = "comparison.html"
 
 
+@dataclass(frozen=True)
+class Probed:
+    """What the groups' networks themselves were asked, and what came of it."""
+
+    tables: Mapping[str, published.Table]
+    films: Mapping[str, bytes]  # mp4, by artifact
+    notes: Sequence[str]
+    facts: Mapping[str, str]  # what was asked of all
+
+
+Probe = Callable[[Mapping[str, Sequence[Training]], str | None], Probed]
+"""Asks the networks of groups, each with each other one; of many groups, with the baseline, if there is one."""
+
+
 def compare(
     question: Question,
     *,
@@ -41,10 +55,12 @@ def compare(
     tracking: TrackingConfig,
     paths: PathsConfig,
     command: str,
+    probe: Probe | None = None,
 ) -> Comparison:
     """Compare all finished runs; print the answers, and keep page, figures and tables as a run of their own.
 
-    The same question of more seeds is the same comparison: its folder holds the looks taken so far.
+    The same question of more seeds is the same comparison: its folder holds the looks taken so far. Whether the
+    networks are asked, too, by `probe`, is no part of the question.
 
     Raises:
         ConfigError: where nothing is to be compared, runs of different protocols would be, or no group is the baseline.
@@ -61,6 +77,9 @@ def compare(
     groups = group(trainings, question.by)
     asked = families([group_of(members, question.by) for members in groups.values()], question)
 
+    # Before a look is spent and the folder held: it takes minutes.
+    probed = probe(groups, asked[-1].plan.baseline if asked else None) if probe else Probed({}, {}, (), {})
+
     identity = {
         **asdict(question),
         "by": list(question.by),
@@ -70,19 +89,25 @@ def compare(
         "groups": [[label, *_recipes(members)] for label, members in groups.items()],
     }
     facts = {**identity, "compared": [training.name for training in trainings]}
-    folder = RunFolder(outputs / "comparisons" / f"{_slug(list(groups))}-{digest(identity)}")
+    folder = RunFolder(outputs / "comparisons" / f"{slug(list(groups))}-{digest(identity)}")
     name, colour = folder.name, run_colour("comparison")
     tags = {"mlflow.runName": name, "mlflow.runColor": colour, "atlantis.kind": "comparison"}
     with folder.held():
         record = read_looks(folder.path, asked)
         comparison = tables.compare(gathered, groups, question, record, look_now)
         write_looks(folder.path, comparison.answers)
+        comparison = replace(
+            comparison,
+            tables={**comparison.tables, **probed.tables},
+            notes=[*comparison.notes, *probed.notes],
+        )
         made = provenance(command)
         shown = {
             "command": made["command"],
             "made": strftime("%Y-%m-%d %H:%M %Z"),
             "code": made.get("git.commit", made["version.atlantis-exp"]),
             "runs": f"{len(trainings)} under {outputs / 'runs'}",
+            **probed.facts,
         }
         figures = draw(comparison)
         with publishing(folder, tracking, outputs, tags) as journal:
@@ -94,6 +119,8 @@ def compare(
             journal.artifact(_PAGE, page(comparison, figures, shown).encode())
             for name, figure in figures.items():
                 journal.artifact(f"figures/{name}.png", figure.png)
+            for name, film in probed.films.items():
+                journal.artifact(name, film)
             for name, table in comparison.tables.items():
                 journal.artifact(f"tables/{name}.csv", tables.to_csv(with_units(name, table)).encode())
                 journal.artifact(f"tables/{name}.tex", to_latex(name, table).encode())
@@ -135,7 +162,7 @@ def _metrics(comparison: Comparison) -> dict[str, float]:
     metrics: dict[str, float] = {}
     for row in comparison.tables["verdict"]:
         if row["seeds"]:
-            pair = f"difference/{_slug([row['group']])} over {_slug([row['other']])}"
+            pair = f"difference/{slug([row['group']])} over {slug([row['other']])}"
             metrics |= {pair: row["difference"], f"{pair}/decided": float(row["said"] != "not decided")}
     return metrics
 
@@ -161,6 +188,6 @@ def _print(comparison: Comparison) -> None:
         console.print(f"\n{sentence}")
 
 
-def _slug(groups: list[str]) -> str:
-    """A folder's name from the groups' labels."""
+def slug(groups: Sequence[str]) -> str:
+    """What a folder or a file is called after the groups' labels."""
     return re.sub(r"[^A-Za-z0-9.]+", "-", "-vs-".join(groups))[:80].strip("-")

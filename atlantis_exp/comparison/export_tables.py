@@ -20,10 +20,12 @@ _POINTS = (
     *("low", "high", "lower_quartile", "upper_quartile", "standard_error", "score", "tau"),
     *("leader_score", "other_score", "difference", "difference_low", "difference_high"),
     *("upper_score", "lower_score", "detectable", "delta", "score_low", "score_high", *SOURCES),
+    *("later_score", "other_later_score"),
 )
 _FRACTIONS = (
     *("time_cap_share", "truncated_share", "random_share", "probability", "share", "network", "random"),
     *("human_normalised_mean", "upper_share", "error", "spent"),
+    *("equal_actions", "equal_by_chance", "equal_where_clear"),
 )
 
 UNITS: Mapping[str, str] = {
@@ -44,6 +46,7 @@ UNITS: Mapping[str, str] = {
 updates. A column that is not here counts something that its name says, or is no quantity."""
 
 _UNITS_OF: Mapping[str, Mapping[str, str]] = {
+    "partings": {"step": "steps", "frame": "frames"},
     "improvement": {"low": _FRACTION, "high": _FRACTION},
     "profile": {"low": _FRACTION, "high": _FRACTION},
     "why": dict.fromkeys(SOURCES, "points/1,000 frames"),

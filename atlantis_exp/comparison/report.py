@@ -92,6 +92,33 @@ COLUMNS = {
         "same_as": "counts as one with",
     },
     "actions": {"group": "group", "action": "action", "network": "network", "random": "chance"},
+    "probes": {
+        "group": "group",
+        "run": "its run",
+        "other": "against",
+        "other_run": "its run",
+        "states": "states",
+        "equal_actions": "equal actions",
+        "equal_by_chance": "by chance",
+        "equal_where_clear": "where both are clear",
+        "advantage_distance": "distance of advantages",
+        "state_value_correlation": "rank correlation of state values",
+    },
+    "partings": {
+        "group": "group",
+        "other": "against",
+        "seed": "seed of the game",
+        "outcome": "outcome",
+        "step": "at step",
+        "frame": "frame",
+        "score": "score so far",
+        "action": "group chose",
+        "other_action": "other chose",
+        "values": "group's values",
+        "other_values": "other's values",
+        "later_score": "group's score at the film's end",
+        "other_later_score": "other's",
+    },
     "references": {"name": "player", "score": "score", "protocol": "protocol", "source": "source"},
     "skipped": {"run": "run", "reason": "why it is left out"},
 }
@@ -99,7 +126,7 @@ COLUMNS = {
 
 _SHARES = {
     *("time_cap_share", "upper_share", "probability", "network", "random", "human_normalised_mean"),
-    *("error", "spent"),
+    *("error", "spent", "equal_actions", "equal_by_chance", "equal_where_clear"),
 }
 _ENDS = {
     ("scores", "score"): ("low", "high"),

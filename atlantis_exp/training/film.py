@@ -20,6 +20,7 @@ class Moment(NamedTuple):
 
     screen: npt.NDArray[np.uint8]  # (210, 160, 3)
     score: float  # so far
+    frame: int  # so far
     action: int | None
     random: bool
     q_values: npt.NDArray[np.float32] | None  # (actions,), what the network thought of them even where chance chose
@@ -30,14 +31,33 @@ def moments(episode: Episode, emulator: Emulator, stack: int, q_values: QValues 
     observation = emulator.reset(episode.seed)
     stacks = FrameStack(1, observation.shape[0], stack)
     stacks.reset([0], observation[np.newaxis])
-    score = 0.0
+    score, frame = 0.0, 0
     for action, random in zip(episode.actions, episode.random, strict=True):
         values = None if q_values is None else q_values(stacks.state)[0]
-        yield Moment(emulator.screen_rgb(), score, action, bool(random), values)
+        yield Moment(emulator.screen_rgb(), score, frame, action, bool(random), values)
         step = emulator.step(action)
         stacks.push(step.observation[np.newaxis])
         score += step.reward
-    yield Moment(emulator.screen_rgb(), score, None, False, None)
+        frame += step.frames
+    yield Moment(emulator.screen_rgb(), score, frame, None, False, None)
+
+
+def greedy_moments(seed: int, emulator: Emulator, stack: int, q_values: QValues) -> Iterator[Moment]:
+    """Play an episode by the network's best actions alone; stack in observations, as the network wants its states."""
+    observation = emulator.reset(seed)
+    stacks = FrameStack(1, observation.shape[0], stack)
+    stacks.reset([0], observation[np.newaxis])
+    score, frame, over = 0.0, 0, False
+    while not over:
+        values = q_values(stacks.state)[0]
+        action = int(values.argmax())
+        yield Moment(emulator.screen_rgb(), score, frame, action, False, values)
+        step = emulator.step(action)
+        stacks.push(step.observation[np.newaxis])
+        score += step.reward
+        frame += step.frames
+        over = step.terminated or step.truncated
+    yield Moment(emulator.screen_rgb(), score, frame, None, False, None)
 
 
 def film_episode(episode: Episode, actor: Actor, emulator: Emulator, stack: int) -> bytes:
