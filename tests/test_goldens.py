@@ -31,6 +31,7 @@ from atlantis_exp.commands.composing import CONF, checked
 from atlantis_exp.config import Config
 from atlantis_exp.registry import SOURCES
 from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.sessions.job import replaced
 from atlantis_exp.training.fingerprint import history
 
 Command = Callable[..., int]
@@ -183,7 +184,13 @@ def test_a_run_is_named_as_it_was() -> None:
     assert names == {line: golden("run_names", line, name) for line, name in names.items()}
 
 
-@pytest.mark.parametrize("line", LEARNERS)
+@pytest.mark.parametrize(
+    "line",
+    [
+        pytest.param(line, marks=pytest.mark.slow if re.search("double", line) and "rmsprop" not in line else ())
+        for line in LEARNERS
+    ],
+)
 def test_twelve_updates_on_the_same_transitions_make_the_same_weights(line: str) -> None:
     config, memory = composed(*SMALL, *line.split()), filled_memory()
     for name in SAMPLERS:
@@ -259,10 +266,10 @@ def test_an_interrupted_training_of_an_earlier_version_ends_as_it_would_have_unb
 ) -> None:
     run = run_of(outputs, "cnn-prioritized-s2-*")
     if RECORDING:  # what is recorded has never been interrupted
-        assert command(*SMALL, *INTERRUPTED, f"paths.outputs={outputs}/unbroken") == 0
+        assert command(*replaced(SMALL, *INTERRUPTED, f"paths.outputs={outputs}/unbroken")) == 0
         run = run_of(outputs / "unbroken", run.name)
     else:
-        assert command(*SMALL, *INTERRUPTED, "resume=must", f"paths.outputs={outputs}") == 0
+        assert command(*replaced(SMALL, *INTERRUPTED, "resume=must", f"paths.outputs={outputs}")) == 0
         assert f"continuing run {run.name} at step 180" in capsys.readouterr().out
     assert_history_is_as_recorded("interrupted", run)
     assert_weights_are_as_recorded("interrupted after 360 steps", weights_at(run, 360))
@@ -289,7 +296,8 @@ def test_runs_of_an_earlier_version_compare_as_they_did(outputs: Path, command: 
             assert {key: row[key] for key in near} == near, name
             assert len(near) >= 2
     assert set(made) == {path.stem for path in (GOLDENS / "compare").iterdir()}
-    for row in rows_of((tables / "why.csv").read_text()):
+    for with_units in rows_of((tables / "why.csv").read_text()):
+        row = {name.partition(" (")[0]: cell for name, cell in with_units.items()}
         mean, frames, rate, *split = (
             float(row[key]) for key in ("mean", "frames_mean", "points_per_1000_frames", *SOURCES)
         )

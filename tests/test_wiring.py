@@ -17,13 +17,13 @@ from hydra import compose, initialize_config_dir
 from rich.console import Console
 
 from atlantis_exp.build import NETWORKS, build_baseline, build_plan, make_emulator
-from atlantis_exp.commands import VERBS
 from atlantis_exp.commands.baseline import BaselineConfig
 from atlantis_exp.commands.composing import CONF, checked
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.registry import SMALLEST_SIDE
 from atlantis_exp.runs.journal import NullJournal
+from atlantis_exp.sessions.job import replaced
 from atlantis_exp.training.plan import Counters
 from atlantis_exp.training.progress import Pace, Progress
 from atlantis_exp.training.recorder import Played, Recorder
@@ -194,7 +194,14 @@ def test_a_config_asks_for_as_many_pixels_as_its_network_needs(name: str) -> Non
         composed(f"model={name}", f"env.size={smallest - 1}")
 
 
-@pytest.mark.parametrize("preset", sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))
+@pytest.mark.parametrize(
+    "preset",
+    [
+        # The rungs between the first and the last of the ablation differ in one value each.
+        pytest.param(name, marks=pytest.mark.slow if re.match(r"ablation_0[1-9]", name) else ())
+        for name in sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
+    ],
+)
 def test_every_preset_trains(preset: str, started: Started, tmp_path: Path) -> None:
     """Smaller and shorter; `fast` with two environments, while which it learns."""
     envs = 2 if preset == "fast" else 1
@@ -233,14 +240,14 @@ def test_a_training_that_will_not_fit_is_refused_before_it_begins_unless_a_warni
 ) -> None:
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=memory))
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=disk))
-    words = (*tiny_overrides, "evaluation.at_end=false", "budget.steps=20", f"paths.outputs={tmp_path}")
-    assert command(*words, "budget.forecast=refuse") == 1
+    words = replaced(tiny_overrides, "evaluation.at_end=false", "budget.steps=20", f"paths.outputs={tmp_path}")
+    assert command(*replaced(words, "budget.forecast=refuse")) == 1
     shown = capsys.readouterr()
     assert re.fullmatch(rf"atlantis_exp: {shortage}.*; budget\.forecast=warn starts all the same\n", shown.err)
     assert re.search(r"^expect about [\d,]+ steps/s, \d+ minutes for 20 steps, ", shown.out, re.MULTILINE)
     assert not list(tmp_path.glob("runs/*/checkpoints/*/manifest.json"))
     if memory < disk:  # once is enough
-        assert command(*words, "budget.forecast=warn") == 0
+        assert command(*replaced(words, "budget.forecast=warn")) == 0
         shown = capsys.readouterr()
         assert re.search(rf"^warning: {shortage}", shown.out, re.MULTILINE)
         assert "20 steps, " in shown.out.splitlines()[-1]
@@ -252,7 +259,7 @@ def test_what_was_trained_is_evaluated_compared_and_reported(
 ) -> None:
     place = f"paths.outputs={tmp_path}"
     for seed in (0, 1):
-        assert command(*tiny_overrides, f"seed={seed}", "evaluation.every_steps=null", place) == 0
+        assert command(*replaced(tiny_overrides, f"seed={seed}", "evaluation.every_steps=null", place)) == 0
     first, second = sorted(path.name for path in (tmp_path / "runs").iterdir())
     assert [name[: len("cnn-uniform-s0")] for name in (first, second)] == ["cnn-uniform-s0", "cnn-uniform-s1"]
 
@@ -320,16 +327,3 @@ def test_without_a_terminal_a_line_now_and_then_says_how_far_a_training_is(monke
         "episode 23  score 12,345  mean of 20 1,662  duration 1,210 (mean of 100 1,105)  epsilon 0.46  step 3,000  "
         "updates 6,000  100 steps/s  phase first  30.0%  left 0:00:05",
     ]
-
-
-@pytest.mark.parametrize(
-    "verb",
-    VERBS,
-)
-def test_help_of_every_verb_says_what_that_verb_does(
-    verb: str, command: Command, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command(verb, "--help") == 0
-    first, second, *_ = capsys.readouterr().out.splitlines()
-    assert first == f"python -m atlantis_exp {verb} KEY=VALUE ..."
-    assert second == VERBS[verb]

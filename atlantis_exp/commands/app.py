@@ -13,7 +13,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from atlantis_exp.commands.composing import CONF, checked
-from atlantis_exp.commands.overrides import check, launcher
+from atlantis_exp.commands.overrides import check, launcher, refuse_twice
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.sessions.job import command_line
 from atlantis_exp.sessions.launchers import Launcher, job_apart
@@ -61,7 +61,7 @@ class Verb(Generic[T]):
         """
         config_name, typed = self.config_name or self.name, tuple(arguments)
         try:
-            arguments = self.rewrite(arguments)
+            refuse_twice(arguments := self.rewrite(arguments))
             jobs = check(config_name, self.schema, arguments)
             chosen = launcher(config_name, arguments)
         except ConfigError as error:

@@ -36,10 +36,6 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
     for override in overrides:
         if override.is_sweep_override() and not multirun:
             raise ConfigError(f"{override.input_line}: several values are a sweep; add -m")
-    given: dict[str, str] = {}
-    for text, override in zip(texts, overrides, strict=True):
-        if (before := given.setdefault(_key(override), text)) != text:
-            raise ConfigError(f"{text}: {before} says something else; write one of the two")
     hydras = [override for override in overrides if _is_hydras(override)]
     for override in hydras:
         _refuse_hydras(override)
@@ -52,6 +48,14 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
     except (HydraException, OmegaConfBaseException) as error:
         reason = f": {error.__cause__}" if isinstance(error.__cause__, OmegaConfBaseException) else ""
         raise ConfigError(" ".join(re.split("Config search path|full_key:", f"{error}{reason}")[0].split())) from None
+
+
+def refuse_twice(arguments: Sequence[str]) -> None:
+    """Refuse a key that a person gave two values, of which Hydra would take the last. Raises: ConfigError."""
+    given: dict[str, str] = {}
+    for text in read_flags(arguments)[0]:
+        if (before := given.setdefault(_key(read_override(text)), text)) != text:
+            raise ConfigError(f"{text}: {before} says something else; write one of the two")
 
 
 def _refuse_hydras(override: Override) -> None:

@@ -1,6 +1,7 @@
 """One training as it was asked for: its config, what people call it, and the command that repeats it."""
 
 import shlex
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,6 +46,12 @@ class Job:
     def _player(self) -> tuple[str, ...]:
         samplers = dict.fromkeys(phase.sampler for phase in self.config.phase.values())
         return (self.config.model.name, *samplers)
+
+
+def replaced(overrides: Iterable[str], *others: str) -> list[str]:
+    """Overrides with others in the place of those that have their keys."""
+    keys = {text.partition("=")[0] for text in others}
+    return [*(text for text in overrides if text.partition("=")[0] not in keys), *others]
 
 
 def command_line(*arguments: str) -> str:

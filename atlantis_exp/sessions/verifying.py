@@ -15,7 +15,7 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.provenance import provenance
-from atlantis_exp.sessions.job import Job, command_line, labels
+from atlantis_exp.sessions.job import Job, command_line, labels, replaced
 from atlantis_exp.tracking.publishing import publishing
 from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.fingerprint import fingerprint
@@ -27,7 +27,7 @@ def verify_resume(job: Job) -> None:
     """Train once unbroken and once with SIGKILLs at random moments, compare, and record the verdict as a run."""
     config, outputs = job.config, job.outputs
     folder = RunFolder(outputs / "verifications" / config.run_name())
-    overrides = [*job.overrides, "tracking=none"]
+    overrides = replaced(job.overrides, "tracking=none")
     with folder.held():
         for name in ("unbroken", "killed"):
             shutil.rmtree(folder.path / name, ignore_errors=True)
@@ -63,7 +63,7 @@ def train_and_kill(config: Config, overrides: Sequence[str], outputs: Path, kill
     """
     # When commits happen changes nothing, and without one there is nothing to continue from.
     own = (f"paths.outputs={outputs}", "tracking.commit_seconds=1.0", "resume=auto")
-    command = (sys.executable, "-m", "atlantis_exp", "train", *overrides, *own)
+    command = (sys.executable, "-m", "atlantis_exp", "train", *replaced(overrides, *own))
     folder = outputs / "runs" / config.run_name()
     struck = 0
     while True:

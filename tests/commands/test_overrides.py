@@ -10,7 +10,7 @@ from atlantis_exp.commands.baseline import BaselineConfig
 from atlantis_exp.commands.compare import CompareConfig
 from atlantis_exp.commands.evaluate import EvaluateConfig
 from atlantis_exp.commands.export import ExportConfig
-from atlantis_exp.commands.overrides import check
+from atlantis_exp.commands.overrides import check, refuse_twice
 from atlantis_exp.commands.play import PlayConfig
 from atlantis_exp.commands.query import QueryConfig
 from atlantis_exp.commands.report import ReportConfig
@@ -163,10 +163,6 @@ MISTAKES = [  # what is written, and what the one line must hold
             *("~hydra.launcher", "hydra.launcher={a:1}"),
         )
     ),
-    # twice
-    ("seed=1 seed=2", "seed=2", "seed=1"),
-    ("model=cnn model=resnet", "model=resnet", "model=cnn"),
-    ("-m seed=0,1 seed=2", "seed=2", "seed=0,1"),
     # too much
     ("replay.capacity=1000000000000000000", "replay.capacity", "less than or equal to 1000000000"),
     (f"seed={'9' * 5_000}", "seed=999", "digits"),
@@ -215,6 +211,14 @@ def test_a_mistake_is_one_line_that_names_the_key_and_what_would_be_right(line: 
     assert key in message
     assert hint in message
     assert "\n" not in message
+
+
+@pytest.mark.parametrize("line", ["seed=1 seed=2", "model=cnn model=resnet", "-m seed=0,1 seed=2", "seed=1 +seed=2"])
+def test_a_key_given_twice_is_refused(line: str) -> None:
+    *_, first, second = line.split()
+    with pytest.raises(ConfigError, match=f"^{re.escape(second)}: {re.escape(first)} says something else"):
+        refuse_twice(line.split())
+    refuse_twice([first, first])
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,7 @@ def test_broken_unfinished_foreign_and_put_aside_runs_are_named_and_do_not_count
         "foreign: its config.json is not one of ours": lambda run: (run / "config.json").write_text('{"lr": 1}'),
         "foreign: it has no config.json": lambda run: (run / "config.json").unlink(),
         "no evaluation after its last step: evaluate run=": lambda run: shutil.rmtree(run / "artifacts"),
-        "broken: .*has no episode": lambda run: next(run.rglob("*.csv")).write_text("score,steps\n"),
+        "broken: .*it has none": lambda run: next(run.rglob("*.csv")).write_text("score,steps\n"),
         "broken: .*result.json is damaged": lambda run: (run / "result.json").write_text("[1]"),
         "does not say who chose": lambda run: next(run.rglob("*.csv")).write_text("score,steps,truncated\n1,1,0\n"),
     }

@@ -224,7 +224,7 @@ def through_a_file(state: dict[str, Any]) -> dict[str, Any]:
 @pytest.mark.parametrize(
     "settings",
     [
-        {"frameskip": (2, 5), "max_steps": 500},
+        pytest.param({"frameskip": (2, 5), "max_steps": 500}, marks=pytest.mark.slow),
         {"frameskip": 4, "max_pool": True, "noop_max": 30, "max_frames": 1_998},
     ],
 )

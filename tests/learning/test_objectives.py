@@ -109,6 +109,7 @@ def test_the_quantile_loss_is_the_paper_s_sum_written_out(seed: int) -> None:
         assert losses[b].item() == pytest.approx(expected, rel=1e-5, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_the_quantile_loss_is_least_at_the_quantiles() -> None:
     """Of targets spread over 100, so wide that the loss is nearly the quantiles' own, not Huber's rounding of it."""
     z_11N = torch.zeros(1, 1, 4, requires_grad=True)

@@ -22,6 +22,7 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import read_commit
 from atlantis_exp.sessions.deciding import _Session, decide
+from atlantis_exp.sessions.job import replaced
 from atlantis_exp.tracking.publishing import catch_up
 
 REPOSITORY = Path(__file__).parents[2]
@@ -42,7 +43,7 @@ def asking(tiny_overrides: tuple[str, ...], tmp_path: Path) -> Asking:
     """A decision as a command line asks for it: `asking("model=cnn,resnet")`."""
 
     def asked(*words: str) -> _Session:
-        typed = (*tiny_overrides, f"paths.outputs={tmp_path}", *words)
+        typed = tuple(replaced(tiny_overrides, f"paths.outputs={tmp_path}", *words))
         several = swept(typed)
         ((texts, config),) = check("decide", DecideConfig, [text for text in typed if text not in several]).items()
         return _Session.of(request_of(Asked(config, "decide", texts, typed=typed)))
@@ -55,7 +56,7 @@ def deciding(tiny_overrides: tuple[str, ...], tmp_path: Path) -> Callable[..., s
     """Starts a decision as a shell does."""
 
     def start(*words: str, env: dict[str, str] | None = None) -> subprocess.Popen[str]:
-        overrides = (*tiny_overrides, *SHORT, f"paths.outputs={tmp_path / 'o'}", *words)
+        overrides = replaced(tiny_overrides, *SHORT, f"paths.outputs={tmp_path / 'o'}", *words)
         return subprocess.Popen(
             (sys.executable, "-m", "atlantis_exp", "decide", *overrides),
             cwd=REPOSITORY,
@@ -115,6 +116,7 @@ def test_contenders_are_trained_level_until_a_look_decides_and_compare_says_the_
     assert {name: (tmp_path / "runs" / name / "result.json").stat().st_mtime_ns for name in began} == began
 
 
+@pytest.mark.slow
 def test_decided_pairs_are_dropped_and_the_page_in_mlflow_has_each_look_once(
     asking: Asking, recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -174,6 +176,7 @@ def test_seeds_that_are_there_are_looked_at_without_a_training(
     assert set((tmp_path / "runs").iterdir()) == before
 
 
+@pytest.mark.slow
 def test_seeds_that_play_equal_games_end_in_one_line(asking: Asking, recorded: Recorded) -> None:
     record_seeds(recorded, 1_000, range(10), "model=cnn")
     for seed in range(10):
@@ -213,6 +216,7 @@ def test_a_training_that_fails_ends_the_decision_in_one_line_that_says_how_it_go
     assert session.folder.status == "FAILED"
 
 
+@pytest.mark.slow
 def test_the_same_question_is_the_same_decision_however_it_is_written(asking: Asking) -> None:
     one = asking("optimizer.lr=0.001,0.002", "budget.steps=1_000_000")
     for line in (
@@ -229,6 +233,7 @@ def said(session: _Session, capsys: pytest.CaptureFixture[str]) -> str:
     return capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_before_it_starts_it_says_runs_hours_and_what_it_can_find(
     asking: Asking, recorded: Recorded, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -22,7 +22,7 @@ from atlantis_exp.config import Config, PathsConfig
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal, read_commit
-from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.launchers import BASIC, Launcher
 from atlantis_exp.sessions.launchers.joblib import _shared_cores
 from atlantis_exp.sessions.live import LiveTable
@@ -44,7 +44,8 @@ def sweep(tiny_overrides: tuple[str, ...], tmp_path: Path) -> Iterator[Sweep]:
 
     def start(*overrides: str) -> subprocess.Popen[bytes]:
         chosen = [word for word in tiny_overrides if word != "tracking=none"]
-        command = (sys.executable, "-m", "atlantis_exp", "-m", *chosen, f"paths.outputs={tmp_path / 'o'}", *overrides)
+        words = replaced(chosen, f"paths.outputs={tmp_path / 'o'}", *overrides)
+        command = (sys.executable, "-m", "atlantis_exp", "-m", *words)
         environment = {key: value for key, value in os.environ.items() if key != "OMP_NUM_THREADS"}
         with open(tmp_path / "printed.txt", "w") as printed:
             process = subprocess.Popen(

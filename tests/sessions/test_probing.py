@@ -134,6 +134,7 @@ def test_a_network_agrees_with_itself_and_never_parts(trained: list[Training], f
     assert result.facts == {"networks asked about": f"128 archived states, SHA-256 {read_archive().sha256}"}
 
 
+@pytest.mark.slow
 def test_the_same_runs_give_the_same_tables_words_and_films(trained: list[Training], folder: Path) -> None:
     groups = {"../../a": [trained[0]], "<b>": [trained[1]]}
     first = probe_groups(folder, groups, None)
@@ -223,6 +224,7 @@ def test_the_run_of_the_median_score_speaks_for_a_group(recorded: Callable[..., 
     assert median_run([run for run in runs if run.config["seed"] != 2]).config["seed"] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("baseline", "first"), [(None, "a x"), ("d", "d x")])
 def test_of_many_groups_each_is_compared_with_one(
     trained: list[Training], folder: Path, monkeypatch: pytest.MonkeyPatch, baseline: str | None, first: str

@@ -21,7 +21,7 @@ from atlantis_exp.commands.search import SearchConfig, request_of
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Metrics, Tags, read, read_commit
-from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.stopping import StopRequest
 from atlantis_exp.sessions.training import train
 
@@ -39,7 +39,7 @@ def searching(tmp_path: Path, tiny_overrides: tuple[str, ...]) -> "Callable[...,
     """A search as a command line asks for it: `searching("trials=3", space=SPACE)`."""
 
     def asked(*overrides: str, space: tuple[str, ...] = SPACE) -> Request:
-        fixed = (*tiny_overrides, *SHORT, f"paths.outputs={tmp_path}", *overrides)
+        fixed = tuple(replaced(tiny_overrides, *SHORT, f"paths.outputs={tmp_path}", *overrides))
         ((texts, config),) = check("search", SearchConfig, fixed).items()
         return request_of(Asked(config, "search", texts, typed=(*fixed, *space)))
 

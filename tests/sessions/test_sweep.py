@@ -18,7 +18,7 @@ from atlantis_exp.commands.jobs import words_of
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.journal import read_commit
-from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.sweep import ledger
 from atlantis_exp.sessions.training import train
 
@@ -49,7 +49,7 @@ def test_runs_trained_by_processes_of_their_own_have_one_parent_and_a_repeated_s
 ) -> None:
     outputs = pair[0].outputs
     with ledger(pair, ["seed=0,1"]):
-        command = (sys.executable, "-m", "atlantis_exp", *tiny_overrides, *SHORT, f"paths.outputs={outputs}")
+        command = (sys.executable, "-m", "atlantis_exp", *replaced(tiny_overrides, *SHORT, f"paths.outputs={outputs}"))
         processes = [
             subprocess.Popen((*command, f"seed={job.config.seed}"), cwd=REPOSITORY, stdout=subprocess.DEVNULL)
             for job in pair

@@ -22,7 +22,7 @@ from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.facts import read_facts
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Artifact, Image, Journal, Metrics, Model, read
-from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.training import train
 from atlantis_exp.sessions.verifying import fingerprints, train_and_kill
 from atlantis_exp.tracking.publishing import catch_up
@@ -39,6 +39,7 @@ SHORT = ("phase.quick.steps=40", "evaluation.at_end=false", "evaluation.every_st
 LONG = ("phase.quick.steps=100_000", "evaluation.every_steps=null", "tracking.commit_seconds=0.2")
 
 
+@pytest.mark.slow
 def test_the_forecast_is_measured_before_there_is_anything_for_mlflow(
     tiny: Compose, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -83,7 +84,7 @@ def at(config: Config, outputs: Path) -> Config:
 def session(config: Config, tiny_overrides: tuple[str, ...], *overrides: str, **environment: str) -> Any:
     """A training in a process of its own."""
     return subprocess.Popen(
-        (*COMMAND, "train", *tiny_overrides, f"paths.outputs={config.paths.outputs}", *overrides),
+        (*COMMAND, "train", *replaced(tiny_overrides, f"paths.outputs={config.paths.outputs}", *overrides)),
         cwd=REPOSITORY,
         env={**os.environ, **environment},
         stdout=subprocess.PIPE,
@@ -295,8 +296,15 @@ def test_a_journal_that_was_cut_is_one_clear_line(tiny: Compose) -> None:
         train(Job(tiny("evaluation.at_end=false", "evaluation.every_steps=null")))
 
 
-@pytest.mark.parametrize("sampler", ["uniform", "prioritized"])
-@pytest.mark.parametrize("damaged", ["oldest", "newest"])
+@pytest.mark.parametrize(
+    ("sampler", "damaged"),
+    [
+        ("prioritized", "newest"),
+        ("uniform", "oldest"),
+        pytest.param("prioritized", "oldest", marks=pytest.mark.slow),
+        pytest.param("uniform", "newest", marks=pytest.mark.slow),
+    ],
+)
 def test_a_damaged_part_of_the_replay_memory_costs_that_part_and_is_said(
     tiny: Compose, sampler: str, damaged: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -334,6 +342,7 @@ def journaled(folder: Path) -> list[tuple[Any, ...]]:
     return sorted(found, key=lambda point: (point[0], point[2], point[1]))
 
 
+@pytest.mark.slow
 def test_a_killed_run_is_shown_as_interrupted_then_continued_and_sigterm_ends_it_with_143(
     tiny: Compose, tiny_overrides: tuple[str, ...]
 ) -> None:
@@ -443,7 +452,7 @@ def test_a_sweep_runs_what_is_missing_and_tables_what_it_found(
     capsys.readouterr()
     monkeypatch.setattr(sys, "argv", ["atlantis_exp"])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    VERB.run([*tiny_overrides, *SHORT, f"paths.outputs={config.paths.outputs}", "seed=0,1", "-m"])
+    VERB.run([*replaced(tiny_overrides, *SHORT, f"paths.outputs={config.paths.outputs}", "seed=0,1"), "-m"])
     done, error = capsys.readouterr()
     assert error == ""
     tables = [line for line in done.splitlines() if line.startswith("sweep of 2 runs")]
@@ -466,9 +475,9 @@ def test_a_training_killed_twenty_times_is_the_unbroken_one_and_mlflow_has_each_
 ) -> None:
     chosen = (*overrides, "evaluation.every_steps=null", "tracking.histogram_episodes=100", "tracking.every_steps=100")
     config = tiny(*chosen)
-    assert train_and_kill(config, (*tiny_overrides, *chosen), tmp_path / "unbroken", 0) == 0
+    assert train_and_kill(config, replaced(tiny_overrides, *chosen), tmp_path / "unbroken", 0) == 0
     killed = tmp_path / "killed"
-    struck = train_and_kill(config, (*tiny_overrides, *chosen, "tracking=mlflow"), killed, 20)
+    struck = train_and_kill(config, replaced(tiny_overrides, *chosen, "tracking=mlflow"), killed, 20)
     assert struck >= 15  # each after a commit of its own session; the last ones may find the training at its end
     assert fingerprints(config, tmp_path / "unbroken") == fingerprints(config, killed)
     publish(killed / "runs" / config.run_name(), Store(killed))  # what the last command did not wait for
@@ -499,7 +508,9 @@ def test_a_machine_that_cannot_compile_is_told_in_one_line(tiny_overrides: tuple
 
 @pytest.mark.slow
 def test_verify_resume_records_its_verdict(tiny_overrides: tuple[str, ...], tmp_path: Path) -> None:
-    overrides = (*tiny_overrides, "phase.quick.steps=4_000", "evaluation.every_steps=null", f"paths.outputs={tmp_path}")
+    overrides = replaced(
+        tiny_overrides, "phase.quick.steps=4_000", "evaluation.every_steps=null", f"paths.outputs={tmp_path}"
+    )
     done = subprocess.run(
         (*COMMAND, "verify-resume", *overrides), cwd=REPOSITORY, capture_output=True, text=True, check=False
     )

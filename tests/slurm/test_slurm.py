@@ -21,7 +21,7 @@ from atlantis_exp.commands.overrides import check
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.launchers.slurm import all_awaited
 from atlantis_exp.sessions.training import train
 from atlantis_exp.sessions.verifying import fingerprints
@@ -125,7 +125,7 @@ def test_jobs_that_are_preempted_requeued_timed_out_or_cancelled_end_as_the_unbr
     folders = [RunFolder.of(config) for config in configs]
     (tmp_path / "sitecustomize.py").write_text(AUDIT.format(log=str(tmp_path / "told")))
     environment = {**slurm, "PYTHONPATH": str(tmp_path)}
-    overrides = (*tiny_overrides, *chosen, f"paths.outputs={tmp_path}", "seed=0,1,2,3", *LAUNCHER)
+    overrides = replaced(tiny_overrides, *chosen, f"paths.outputs={tmp_path}", "seed=0,1,2,3", *LAUNCHER)
     command = (*COMMAND, "train", "-m", *overrides)
 
     def say(*words: str) -> str:
@@ -209,7 +209,7 @@ def test_a_decision_has_slurm_train_what_it_needs(
         *("env.max_steps=100,900", "seeds=5", "phase.quick.steps=40", "training.learn_every=10"),
         *("evaluation.every_steps=null", "evaluation.epsilon=0.5", "evaluation.seed=${seed}", "evaluation.episodes=4"),
     )
-    words = (*tiny_overrides, *chosen, f"paths.outputs={tmp_path}", *LAUNCHER)
+    words = replaced(tiny_overrides, *chosen, f"paths.outputs={tmp_path}", *LAUNCHER)
     decided = subprocess.run(
         (*COMMAND, "decide", *words), cwd=REPOSITORY, env=slurm, capture_output=True, text=True, check=False
     )

@@ -617,6 +617,7 @@ def test_a_store_out_of_reach_is_reported_once_and_caught_up_with_once_it_is_bac
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "store"]  # nothing in the working directory
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("stores_without_tables")
 def test_a_process_killed_while_it_makes_the_tables_breaks_nothing(tmp_path: Path) -> None:
     killed = f"""

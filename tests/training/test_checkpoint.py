@@ -227,9 +227,8 @@ def _commit_and_die(trainer: Trainer, folder: Path, operation: int) -> None:
     os._exit(0)
 
 
-@pytest.mark.parametrize(
-    "continued", [pytest.param(False, id="loaded"), pytest.param(True, id="continued", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("continued", [pytest.param(False, id="loaded"), pytest.param(True, id="continued")])
 def test_a_death_at_any_file_operation_of_a_commit_leaves_the_commit_before_or_this_one(
     small: Callable[..., Trainer], tmp_path: Path, continued: bool
 ) -> None:

@@ -67,7 +67,16 @@ def assert_same_but_for_evaluations(trainers: Mapping[str, Trainer], folder: Pat
     without, with_evaluations = prints
     differing = {part for part in without if without[part] != with_evaluations[part]}
     assert differing == {
-        *("best_mean", "best_step", "evaluations", "evaluated_at", "last_report", "last_metrics", "history")
+        *(
+            "best_mean",
+            "best_step",
+            "best_sha256",
+            "evaluations",
+            "evaluated_at",
+            "last_report",
+            "last_metrics",
+            "history",
+        )
     }
     for key in ("score/episode", "learning/loss", "actions/epsilon"):
         assert curve(folder / "never", key) == curve(folder / "often", key) != []
