@@ -1,6 +1,7 @@
 """Imports go down only, each outside library stays in its room, and the gradient is few calls away."""
 
 import ast
+import re
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Set
 from graphlib import CycleError, TopologicalSorter
@@ -215,3 +216,15 @@ def test_the_gradient_is_seven_calls_of_ours_from_the_command_line(
     with pytest.raises(Reached) as reached:
         command(*tiny_overrides, f"paths.outputs={tmp_path}")
     assert calls_of_ours(reached.value) == ["main", "run", "task", "train", "run", "update", "_gradients"]
+
+
+def test_files_that_the_pages_name_are_there() -> None:
+    root = PACKAGE.parent
+    pages = [root / "README.md", root / "CONTRIBUTING.md", root / "SECURITY.md", *(root / "docs").glob("*.md")]
+    named = {
+        (page.name, path)
+        for page in pages
+        for path in re.findall(r"`((?:tests|benchmarks|docs|conf|atlantis_exp)/[\w./]+)`", page.read_text())
+    }
+    assert len(named) > 20
+    assert {(page, path) for page, path in named if not (root / path).exists()} == set()

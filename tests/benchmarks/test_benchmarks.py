@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import emulation, learner, overhead, replay, store, training
+from benchmarks import emulation, kills, learner, overhead, replay, store, training
 from benchmarks.contest import paired_ratio, ratio, take_turns
 
 Main = Callable[[Sequence[str]], None]
@@ -121,3 +121,8 @@ def test_store_measures_every_command_over_many_runs(
         assert results[f"{command}_s"] > 0, command
         assert results[f"{command}_mib"] > 0, command
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_kills_counts_them_and_finds_no_difference(capsys: pytest.CaptureFixture[str]) -> None:
+    assert results_of(kills.main, "--kills 2 --only prioritized", capsys) == {"kills": 2, "differences": []}
