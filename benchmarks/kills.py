@@ -68,6 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             place = Path(folder, f"{name}-{copy}")
             kills, prints = _killed(name, place, min(left, _KILLS_OF_ONE))
             struck[name] += kills
+            progress.console.print(f"copy {copy}: {name}, killed {kills} times", highlight=False)
             progress.advance(bar, kills)
             parts = sorted(part for part in prints if prints[part] != unbroken[name].get(part))
             differences += [f"{name}, copy {copy}: {part}" for part in parts]

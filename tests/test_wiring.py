@@ -220,7 +220,11 @@ def test_every_preset_trains(preset: str, started: Started, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("memory", "disk", "shortage"),
     [
-        (2**20, 2**40, r"memory will not suffice: \d+ MiB needed, 1 MiB available; lower replay.max_bytes or replay."),
+        pytest.param(
+            *(2**20, 2**40),
+            r"memory will not suffice: \d+ MiB needed, 1 MiB available; lower replay.max_bytes or replay.",
+            marks=pytest.mark.slow,
+        ),
         (
             2**40,
             2**20,

@@ -116,7 +116,9 @@ def test_pooled_stacked_states_are_those_of_atari_preprocessing(seed: int, noop_
     assert all(end.terminated for end in ends)
 
 
-@pytest.mark.parametrize("max_frames", [400, 401, 402, 403])
+@pytest.mark.parametrize(
+    "max_frames", [401, *(pytest.param(frames, marks=pytest.mark.slow) for frames in (400, 402, 403))]
+)
 def test_frames_left_in_the_pool_by_an_unfinished_step_are_those_of_atari_preprocessing(max_frames: int) -> None:
     ends = play_beside_atari_preprocessing(seed=3, noop_max=0, max_frames=max_frames)
     assert all(end.truncated and end.frames == (max_frames % 4 or 4) for end in ends)
@@ -133,6 +135,7 @@ def test_a_held_button_scores_two_thousand_points() -> None:
         assert score + step.reward == 2_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("actions", "never", "seed", "bonuses"),
     [

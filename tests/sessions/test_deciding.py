@@ -163,6 +163,7 @@ def test_decided_pairs_are_dropped_and_the_page_in_mlflow_has_each_look_once(
     assert page() == first
 
 
+@pytest.mark.slow
 def test_seeds_that_are_there_are_looked_at_without_a_training(
     asking: Asking, recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -189,6 +190,7 @@ def test_seeds_that_play_equal_games_end_in_one_line(asking: Asking, recorded: R
     assert session.folder.status == "FAILED"
 
 
+@pytest.mark.slow
 def test_a_run_that_cannot_be_compared_is_named(asking: Asking, recorded: Recorded) -> None:
     record_seeds(recorded, 1_000, range(5), "model=cnn")
     record_seeds(recorded, 2_000, range(5), "model=resnet")

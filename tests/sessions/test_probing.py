@@ -174,6 +174,7 @@ def test_networks_part_where_a_naive_loop_finds_it(
     assert frames_of(film) == 2 * 20  # three frames a step
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("early", [0, 1])
 def test_the_last_picture_of_the_game_that_ends_first_stays(
     nearly_alike: tuple[Network, Network], early: int, monkeypatch: pytest.MonkeyPatch

@@ -118,6 +118,7 @@ def test_a_run_that_has_ended_is_reported_and_not_trained_again(
     assert folder.state == "done"
 
 
+@pytest.mark.slow
 def test_a_larger_budget_continues_a_run_that_its_budget_ended(tiny: Compose) -> None:
     for steps in ("80", "120", "null"):
         config = tiny(f"budget.steps={steps}", "evaluation.at_end=false", "evaluation.every_steps=null")
@@ -133,10 +134,11 @@ def test_a_larger_budget_continues_a_run_that_its_budget_ended(tiny: Compose) ->
 @pytest.mark.parametrize(
     ("name", "damaged"),
     [
-        ("result.json", ""),
-        ("result.json", "[1]"),
+        *(pytest.param("result.json", text, marks=pytest.mark.slow) for text in ("", "[1]")),
         ("result.json", '{"outcome": "finished", "steps": "many", "counts": {}, "evaluation": {}, "report": ""}'),
-        ("commit.json", '{"identity": "a", "started": 1, "updated": 1, "offset": 0'),
+        pytest.param(
+            "commit.json", '{"identity": "a", "started": 1, "updated": 1, "offset": 0', marks=pytest.mark.slow
+        ),
         ("commit.json", '{"identity": "a", "started": 1, "updated": 1, "offset": "0", "status": "RUNNING"}'),
     ],
 )

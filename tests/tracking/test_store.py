@@ -186,6 +186,7 @@ def same_but_for_ids(shown: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+@pytest.mark.slow
 def test_a_process_killed_between_sending_and_noting_it_doubles_nothing(
     tmp_path: Path, root: Path, store: Store
 ) -> None:

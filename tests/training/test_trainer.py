@@ -127,7 +127,10 @@ def test_the_same_seed_gives_the_same_training_and_another_seed_another(small: S
             ("model=resnet", "env.size=16", "env.num_envs=1", "optimizer=rmsprop", "objective.target.mode=train"),
             marks=pytest.mark.slow,
         ),
-        ("env.num_envs=3", "env.workers=2", "sampler=prioritized", "phase.quick.sampler=prioritized"),
+        pytest.param(
+            ("env.num_envs=3", "env.workers=2", "sampler=prioritized", "phase.quick.sampler=prioritized"),
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             (
                 *("objective=quantile", "lr_schedule=one_cycle", "objective.n_step=3"),
