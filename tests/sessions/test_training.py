@@ -398,8 +398,8 @@ def test_a_server_that_is_gone_for_a_while_has_everything_once_it_is_back(
     server = tmp_path / "server"
     server.mkdir()
     chosen = (
-        *("tracking=mlflow", f"tracking.uri=http://127.0.0.1:{port}", "tracking.every_steps=200", *LONG),
-        *("evaluation.every_steps=1_000", "tracking.histogram_episodes=50"),
+        *("tracking=mlflow", f"tracking.uri=http://127.0.0.1:{port}", "tracking.every_steps=200"),
+        *replaced(LONG, "evaluation.every_steps=1_000", "tracking.histogram_episodes=50"),
     )
     config = tiny(*chosen)
     folder = RunFolder.of(config).path
