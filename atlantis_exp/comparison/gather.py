@@ -15,7 +15,7 @@ from atlantis_exp.checking import flatten, nearest, parse, to_dict
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.episodes import EpisodeTable
-from atlantis_exp.runs.facts import read_facts
+from atlantis_exp.runs.facts import read_tags
 from atlantis_exp.runs.folder import EVALUATION, RESULT, RunFolder, evaluation_at
 from atlantis_exp.runs.journal import curve
 
@@ -242,7 +242,7 @@ def _training(
 ) -> Training:
     points = np.array([[record.values[key] for key in _CURVE.values()] for record in curve(folder.path, _POINT)])
     arrays = dict(zip(_CURVE, points.T, strict=True)) if len(points) else {}
-    tags = read_facts(folder.path).tags
+    tags = read_tags(folder.path)
     if (updates := arrays.pop("updates", None)) is not None and "flops_per_update" in tags:
         arrays["flops"] = updates * float(tags["flops_per_update"])
 
@@ -257,7 +257,7 @@ def _training(
         wanted = "" if epsilon is None else f" at epsilon {epsilon}"
         raise _Unusable(f"no evaluation{wanted} after its last step: evaluate run={folder.name} makes one")
     taken, player, path = tables[-1]
-    policy = (tags if player == folder else read_facts(player.path).tags).get("policy", "")
+    policy = (tags if player == folder else read_tags(player.path)).get("policy", "")
     science = config.science()
     science["phase"] = {str(index): phase for index, phase in enumerate(science["phase"])}
     leaves = flatten(to_dict(config)) | {"evaluation.epsilon": taken}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from atlantis_exp.runs.files import open_file
-from atlantis_exp.runs.journal import Artifact, Tags, read, read_commit
+from atlantis_exp.runs.journal import Artifact, Record, Tags, read, read_commit
 
 
 @dataclass(frozen=True)
@@ -18,28 +18,35 @@ class Facts:
 
 
 def read_facts(folder: Path) -> Facts:
-    """Read a run folder's tags and the names of its files; other lines are passed over, however many there are.
+    """Read a run folder's tags and the names of its files.
 
     Raises:
         OSError, ValueError: on a journal that ends before its commit, or a line that no writer left so.
     """
+    paths = (record.path for record in _records(folder, "artifact") if isinstance(record, Artifact))
+    return Facts(read_tags(folder), tuple(dict.fromkeys(paths)))
+
+
+def read_tags(folder: Path) -> dict[str, str]:
+    """Read each tag's last value. Raises: as `read_facts`."""
     commit = read_commit(folder)
-    tags: dict[str, str] = dict(commit.labels) if commit else {}
-    artifacts: dict[str, None] = {}
+    tags = dict(commit.labels) if commit else {}
+    for record in _records(folder, "tags"):
+        tags |= record.values if isinstance(record, Tags) else {}
+    return tags
+
+
+def _records(folder: Path, kind: str) -> Iterator[Record]:
+    """The committed records of a kind; other lines are passed over, however many there are."""
+    commit = read_commit(folder)
     if commit is None or commit.offset == 0:
-        return Facts(tags, ())
+        return
     with open_file(folder / "journal.jsonl") as file:
         if file.seek(0, 2) < commit.offset:
             raise ValueError(f"{file.name} ends before its commit at {commit.offset}")
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as journal:
-            for kind in ("tags", "artifact"):
-                for start in _lines(journal, f'{{"kind":"{kind}",'.encode(), commit.offset):
-                    for _, record in read(folder, start, start + 1):
-                        if isinstance(record, Tags):
-                            tags |= record.values
-                        elif isinstance(record, Artifact):
-                            artifacts[record.path] = None
-    return Facts(tags, tuple(artifacts))
+            for start in _lines(journal, f'{{"kind":"{kind}",'.encode(), commit.offset):
+                yield from (record for _, record in read(folder, start, start + 1))
 
 
 def _lines(journal: mmap.mmap, opening: bytes, end: int) -> Iterator[int]:

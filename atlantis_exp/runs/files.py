@@ -1,5 +1,6 @@
 """Files of run folders: put in place whole, and read within bounds, since whatever is read may be anybody's."""
 
+import hashlib
 import os
 import stat
 from pathlib import Path
@@ -28,6 +29,11 @@ def read_file(path: Path, most: int) -> bytes:
         if (size := os.fstat(file.fileno()).st_size) > most:
             raise ValueError(f"{path} has {size:,} bytes, more than {most:,}")
         return file.read()
+
+
+def is_whole(content: bytes, sha256: str) -> bool:
+    """Whether a content has a checksum; an empty one, as 0.1.0 left it, is not known."""
+    return sha256 in ("", hashlib.sha256(content).hexdigest())
 
 
 def read_object(content: bytes) -> dict[str, Any]:

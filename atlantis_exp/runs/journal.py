@@ -79,10 +79,6 @@ class Model:
     best: bool = False  # of all of its name so far
     sha256: str = ""  # empty in journals of 0.1.0
 
-    def is_whole(self, content: bytes) -> bool:
-        """Whether a file's content is the one that was recorded, as far as that is known."""
-        return self.sha256 in ("", hashlib.sha256(content).hexdigest())
-
 
 Record = Metrics | Params | Tags | Artifact | Image | Model
 _KINDS: dict[str, TypeAdapter[Record]] = {kind.__name__.lower(): TypeAdapter(kind) for kind in get_args(Record)}

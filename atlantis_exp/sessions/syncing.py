@@ -127,7 +127,7 @@ def _reason(error: Exception, store: Store) -> str:
     """What went wrong with one run. Raises: Fault where it is the store that did."""
     if not isinstance(error, ValueError):  # which is what a run's own files raise
         try:
-            with patience(60):
+            with patience():
                 store.client.get_experiment(store.experiment_id)
         except Exception as fault:
             raise Fault(f"{store.uri} cannot be reached: {_first_line(fault)}") from None

@@ -1,11 +1,9 @@
 """The weights that a stored run has: of its last commit, or of its best evaluation as of that commit."""
 
-import hashlib
-
 import safetensors.torch
 
 from atlantis_exp.faults import Fault
-from atlantis_exp.runs.files import ARTIFACT, read_file
+from atlantis_exp.runs.files import ARTIFACT, is_whole, read_file
 from atlantis_exp.runs.folder import NETWORK, RunFolder
 from atlantis_exp.runs.journal import Model, model_file, read
 from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints
@@ -39,12 +37,12 @@ def stored_weights(run: RunFolder, weights: str) -> tuple[bytes, int]:
 
 
 def _read(run: RunFolder, path: str, sha256: str) -> bytes:
-    """An artifact with weights; an empty checksum, as 0.1.0 left it, is not checked."""
+    """An artifact with weights. Raises: Fault."""
     file = run.artifact(path)
     try:
         content = read_file(file, ARTIFACT)
     except (OSError, ValueError) as error:
         raise Fault(f"run {run.name}: its weights cannot be read: {error}") from None
-    if sha256 not in ("", hashlib.sha256(content).hexdigest()):
+    if not is_whole(content, sha256):
         raise Fault(f"run {run.name}: {file} is damaged, or newer than the run's last commit")
     return content

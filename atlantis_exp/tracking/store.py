@@ -27,7 +27,7 @@ from uuid import UUID, uuid5
 
 from pydantic import AliasChoices, Field, TypeAdapter
 
-from atlantis_exp.runs.files import ARTIFACT, SMALL, open_file, read_file, write_file
+from atlantis_exp.runs.files import ARTIFACT, SMALL, is_whole, open_file, read_file, write_file
 from atlantis_exp.runs.folder import COMMIT, CONFIG, RESULT, TRACEBACK
 from atlantis_exp.runs.journal import (
     Artifact,
@@ -207,7 +207,7 @@ class Store:
                 with closing(sqlite3.connect(database_file)) as database:
                     database.execute("PRAGMA journal_mode=WAL")  # else one slow reader makes a write fail
             client = MlflowClient(self.uri)
-            with nullcontext() if self.is_local else patience(_SECONDS):
+            with nullcontext() if self.is_local else patience():
                 experiment = client.get_experiment_by_name(self._experiment)
             if experiment:
                 return client, experiment.experiment_id
@@ -226,8 +226,8 @@ class TooSlow(Exception):
 
 
 @contextmanager
-def patience(seconds: int) -> Iterator[None]:
-    """Raise TooSlow in the block after so many seconds: a server that sends a byte now and then never times out.
+def patience() -> Iterator[None]:
+    """Raise TooSlow in the block after `_SECONDS`: a server that sends a byte now and then never times out.
 
     Only in the main thread, where a signal can end a wait.
     """
@@ -236,10 +236,10 @@ def patience(seconds: int) -> Iterator[None]:
         return
 
     def give_up(*_: object) -> None:
-        raise TooSlow(f"the server has not answered in full within {seconds} seconds")
+        raise TooSlow(f"the server has not answered in full within {_SECONDS} seconds")
 
     before = signal.signal(signal.SIGALRM, give_up)
-    signal.alarm(seconds)
+    signal.alarm(_SECONDS)
     try:
         yield
     finally:
@@ -251,7 +251,7 @@ def _pages(search: "Callable[..., PagedList[P]]") -> "Iterator[PagedList[P]]":
     """The pages of a search, as far as there may be."""
     token: str | None = None
     for _ in range(_PAGES):
-        with patience(_SECONDS):
+        with patience():
             page = search(page_token=token)
         yield page
         if not (token := page.token):
@@ -267,7 +267,7 @@ class Files:
 
     def names(self, folder: str) -> set[str]:
         """Returns the names of what lies in a folder, none where there is no such folder."""
-        with patience(_SECONDS):
+        with patience():
             return {os.path.basename(file.path) for file in self._repository.list_artifacts(folder)}  # type: ignore[no-untyped-call]
 
     def read(self, path: str, most: int) -> bytes:
@@ -275,14 +275,14 @@ class Files:
         from mlflow.utils.credentials import get_default_host_creds
         from mlflow.utils.rest_utils import http_request
 
-        with patience(_SECONDS):
+        with patience():
             host = get_default_host_creds(self._repository.artifact_uri)  # type: ignore[no-untyped-call]
             response = http_request(host, f"/{path}", "GET", stream=True)  # type: ignore[no-untyped-call]
         with closing(response):
             response.raise_for_status()
             content, chunks = bytearray(), response.iter_content(_PIECE)
             while True:
-                with patience(_SECONDS):
+                with patience():
                     chunk = next(chunks, b"")
                 if not chunk:
                     return bytes(content)
@@ -561,7 +561,9 @@ class _Mirror:
         if isinstance(record, Artifact | Image | Model) and not (self._artifacts / record.path).is_file():
             _log.warning("%s is gone and cannot be published", self._artifacts / record.path)
             return
-        if isinstance(record, Model) and not record.is_whole(read_file(self._artifacts / record.path, ARTIFACT)):
+        if isinstance(record, Model) and not is_whole(
+            read_file(self._artifacts / record.path, ARTIFACT), record.sha256
+        ):
             _log.warning("%s is not what was recorded and is not published", self._artifacts / record.path)
             return
         match record:

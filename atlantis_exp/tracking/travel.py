@@ -15,7 +15,7 @@ from math import inf
 from pathlib import Path
 from typing import Literal, Self
 
-from atlantis_exp.runs.files import ARTIFACT, SMALL, write_file
+from atlantis_exp.runs.files import ARTIFACT, SMALL, is_whole, write_file
 from atlantis_exp.runs.folder import COMMIT
 from atlantis_exp.runs.journal import (
     Artifact,
@@ -82,7 +82,7 @@ def bring(run: StoredRun, folder: Path, store: Store, listed: Collection[str]) -
         ValueError: on what cannot be a run folder's; the folder stays as it was.
         MlflowException, OSError: when the server cannot be reached.
     """
-    with patience(60):
+    with patience():
         files = store.files(store.client.get_run(run.run_id).info.artifact_uri)
     names = files.names(TRAVELS)
     small = {name: files.read(f"{TRAVELS}/{name}", SMALL) for name in (COMMIT, *SMALL_FILES) if name in names}
@@ -192,7 +192,7 @@ def _bring_files(
             if above not in listed:
                 listed[above] = files.names(above)
             content = files.read(there, ARTIFACT) if name in listed[above] else None
-        if isinstance(record, Model) and content is not None and not record.is_whole(content):
+        if isinstance(record, Model) and content is not None and not is_whole(content, record.sha256):
             raise ValueError(f"{path} does not have the checksum that its journal gives it")
         if content is None:
             _log.warning("%s is not on the server and cannot be brought", folder / "artifacts" / path)
