@@ -8,14 +8,9 @@ journal holds. The last of them is a sweep of two seeds on joblib, which is kill
 
 import argparse
 import itertools
-import os
-import random
 import shutil
-import signal
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,7 +18,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from atlantis_exp.sessions.job import replaced
-from atlantis_exp.sessions.verifying import fingerprints, train_and_kill
+from atlantis_exp.sessions.verifying import fingerprints, run_and_kill, train_and_kill
 from benchmarks.composition import composed
 from benchmarks.contest import print_results, print_table
 
@@ -99,24 +94,7 @@ def _sweep_and_kill(outputs: Path, kills: int) -> int:
     own = ("seed=0,1", f"paths.outputs={outputs}", "tracking.commit_seconds=1.0")
     launcher = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
     command = (sys.executable, "-m", "atlantis_exp", "train", "-m", *launcher, *replaced(SMALL, *own))
-    struck = 0
-    while True:
-        before = _commits(outputs)
-        sweep = subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
-        )
-        while struck < kills and sweep.poll() is None:
-            time.sleep(0.01)
-            if _commits(outputs) > before:
-                time.sleep(random.random())
-                os.killpg(sweep.pid, signal.SIGKILL)
-                struck += sweep.wait() == -signal.SIGKILL
-                break
-        else:
-            error = sweep.communicate()[1]
-            if sweep.returncode:
-                raise RuntimeError(f"the sweep under {outputs} failed: {error.strip().splitlines()[-1]}")
-            return struck
+    return run_and_kill(command, outputs, lambda: _commits(outputs), kills, with_children=True)
 
 
 def _commits(outputs: Path) -> int:

@@ -1,12 +1,14 @@
 """Is a training that is killed again and again the unbroken one?"""
 
 import json
+import os
 import random
 import shutil
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from atlantis_exp.build import build_memory
@@ -65,16 +67,35 @@ def train_and_kill(config: Config, overrides: Sequence[str], outputs: Path, kill
     own = (f"paths.outputs={outputs}", "tracking.commit_seconds=1.0", "resume=auto")
     command = (sys.executable, "-m", "atlantis_exp", "train", *replaced(overrides, *own))
     folder = outputs / "runs" / config.run_name()
+    return run_and_kill(command, outputs, lambda: _generation(folder), kills)
+
+
+def run_and_kill(
+    command: Sequence[str], outputs: Path, commits: Callable[[], int], kills: int, *, with_children: bool = False
+) -> int:
+    """Run a command that writes `outputs` to its end, with a SIGKILL at a random moment after a commit, `kills` times.
+
+    Returns how many struck. commits: how many there are so far; with_children: the command's other processes are killed
+    together with it.
+
+    Raises:
+        Fault: a session ended with an error.
+    """
     struck = 0
     while True:
-        before = _generation(folder)
-        session = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        before = commits()
+        session = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=with_children
+        )
         while struck < kills and session.poll() is None:
             time.sleep(0.01)
-            if _generation(folder) > before:
+            if commits() > before:
                 time.sleep(random.random())
-                session.kill()
-                struck += session.wait() == -9
+                if with_children:
+                    os.killpg(session.pid, signal.SIGKILL)
+                else:
+                    session.kill()
+                struck += session.wait() == -signal.SIGKILL
                 break
         else:
             error = session.communicate()[1]
