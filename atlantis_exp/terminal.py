@@ -1,4 +1,4 @@
-"""Texts on a terminal as they are: a name with brackets is no markup, and nothing is coloured by a guess."""
+"""Texts on a terminal as they are, where a name with brackets is no markup, and durations."""
 
 import shutil
 
@@ -11,3 +11,9 @@ def console(least: int | None = None) -> Console:
         return Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
     width = max(shutil.get_terminal_size().columns, least)
     return Console(highlight=False, markup=False, emoji=False, width=width)
+
+
+def clock(seconds: float) -> str:
+    """A duration as hours, minutes and seconds, 26:07:09; what is below zero is zero."""
+    minutes, second = divmod(max(int(seconds), 0), 60)
+    return f"{minutes // 60}:{minutes % 60:02}:{second:02}"

@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache
@@ -45,6 +46,17 @@ TINY = (  # everything that a training can do, in seconds
     *("training.learn_start=20", "training.learn_every=4", "training.batch_size=4", "training.precision=fp32"),
     *("evaluation.episodes=2", "evaluation.num_envs=1", "evaluation.every_steps=80", "evaluation.video=false"),
 )
+
+
+@pytest.hookimpl(tryfirst=True)  # pytest's own deselects the slow ones
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    cases: Counter[str] = Counter()
+    for item in items:
+        if thinned := item.get_closest_marker("thinned"):
+            test = item.nodeid.partition("[")[0]
+            if cases[test] % thinned.args[0]:
+                item.add_marker(pytest.mark.slow)
+            cases[test] += 1
 
 
 @pytest.fixture(scope="session")

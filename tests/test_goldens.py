@@ -178,19 +178,20 @@ def filled_memory() -> ReplayMemory:
     return memory
 
 
-def test_a_run_is_named_as_it_was() -> None:
-    names = {line: composed(*line.split()).run_name() for line in RUN_NAMES}
+@pytest.mark.thinned(5)
+@pytest.mark.parametrize("line", RUN_NAMES)
+def test_a_run_is_named_as_it_was(line: str) -> None:
+    name = composed(*line.split()).run_name()
+    assert name == golden("run_names", line, name)
+
+
+def test_recorded_names_of_runs_differ() -> None:
+    names = json.loads((GOLDENS / "run_names.json").read_bytes())
     assert len(set(names.values())) == len(RUN_NAMES) == 30
-    assert names == {line: golden("run_names", line, name) for line, name in names.items()}
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        pytest.param(line, marks=pytest.mark.slow if re.search("double", line) and "rmsprop" not in line else ())
-        for line in LEARNERS
-    ],
-)
+@pytest.mark.thinned(6)
+@pytest.mark.parametrize("line", LEARNERS)
 def test_twelve_updates_on_the_same_transitions_make_the_same_weights(line: str) -> None:
     config, memory = composed(*SMALL, *line.split()), filled_memory()
     for name in SAMPLERS:
@@ -276,6 +277,7 @@ def test_an_interrupted_training_of_an_earlier_version_ends_as_it_would_have_unb
     assert_text_is_as_recorded("interrupted/episodes.csv", (run / "artifacts" / "episodes.csv").read_text())
 
 
+@pytest.mark.slow
 def test_runs_of_an_earlier_version_compare_as_they_did(outputs: Path, command: Command) -> None:
     assert command("compare", f"paths.outputs={outputs}", "tracking=none") == 0
     (tables,) = outputs.glob("comparisons/*/artifacts/tables")

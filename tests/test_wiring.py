@@ -202,6 +202,7 @@ def test_a_config_asks_for_as_many_pixels_as_its_network_needs(name: str) -> Non
         for name in sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
     ],
 )
+@pytest.mark.thinned(3)
 def test_every_preset_trains(preset: str, started: Started, tmp_path: Path) -> None:
     """Smaller and shorter; `fast` with two environments, while which it learns."""
     envs = 2 if preset == "fast" else 1

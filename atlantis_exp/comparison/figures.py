@@ -123,6 +123,8 @@ def _render(plot: Callable[["Axes"], None], title: str, alt: str, height: float 
 
         figure = Figure(figsize=(4.8, height), layout="constrained")
         plot(figure.add_subplot())
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # the layout is found: each picture would find it twice again
         return Drawn(title, alt, _png(figure), _svg(figure, alt))
 
 

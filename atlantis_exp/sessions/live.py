@@ -3,7 +3,6 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from datetime import timedelta
 
 from rich.console import Console
 from rich.live import Live
@@ -72,7 +71,7 @@ class _Run:
         if self.state != "running" or not hours or not self.done:
             return ""
         since = time.time() - self._updated / 1000
-        return str(timedelta(seconds=int(max(hours * 3600 * (self.length - self.done) / self.done - since, 0))))
+        return terminal.clock(hours * 3600 * (self.length - self.done) / self.done - since)
 
 
 class LiveTable:

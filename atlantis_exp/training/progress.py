@@ -5,7 +5,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import timedelta
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -163,4 +162,4 @@ def _line(snapshot: Snapshot) -> str:
 def _time_left(snapshot: Snapshot) -> str:
     if snapshot.steps_left is None or snapshot.steps_per_second <= 0:
         return "?"
-    return str(timedelta(seconds=int(max(snapshot.steps_left, 0) / snapshot.steps_per_second)))
+    return terminal.clock(snapshot.steps_left / snapshot.steps_per_second)

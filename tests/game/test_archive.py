@@ -44,6 +44,7 @@ def test_it_has_early_and_late_moments_of_three_players_and_no_two_alike() -> No
         (1, 3, 84, (16, 160, 136, 0), False),
     ],
 )
+@pytest.mark.thinned(5)
 def test_a_state_rebuilt_of_frames_is_the_emulators_bit_for_bit(
     frameskip: int, stack: int, size: int, crop: tuple[int, int, int, int], max_pool: bool
 ) -> None:

@@ -255,7 +255,8 @@ def test_a_network_whose_samples_meet_is_not_split() -> None:
 # Compilation
 
 
-@pytest.mark.parametrize("network_class", [DQNCnn, pytest.param(ResNetDQN, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@every_network
 def test_a_compiled_learner_learns_the_same(network_class: type[nn.Module]) -> None:
     """By a backend that needs no compiler; dropout masks are drawn from the same generators."""
     backend = CompileCounterWithBackend("aot_eager")
@@ -315,6 +316,7 @@ def test_a_target_in_train_mode_keeps_running_statistics_of_its_own() -> None:
 
 
 @every_network
+@pytest.mark.thinned(2)
 def test_the_evaluated_network_is_a_mean_of_all_weights_first_and_an_exponential_one_then(
     network_class: type[nn.Module],
 ) -> None:
@@ -337,6 +339,7 @@ def test_the_evaluated_network_is_a_mean_of_all_weights_first_and_an_exponential
 
 @every_network
 @every_precision
+@pytest.mark.thinned(4)
 def test_an_average_changes_neither_learning_nor_acting(network_class: type[nn.Module], precision: Precision) -> None:
     shards = 2 if network_class is DQNCnn else 1
     plain, averaged = (_learner(network_class, precision=precision, shards=shards, ema=ema) for ema in (None, 20))
@@ -501,6 +504,7 @@ def test_the_first_loss_that_is_no_number_is_remembered(poison: float) -> None:
         *(pytest.param(*case, marks=pytest.mark.slow) for case in (("eval", None), ("train", 15))),
     ],
 )
+@pytest.mark.thinned(4)
 def test_a_restored_learner_continues_bit_for_bit(
     network_class: type[nn.Module], precision: Precision, target_mode: Literal["eval", "train"], ema: int | None
 ) -> None:
@@ -528,6 +532,7 @@ def test_a_restored_learner_continues_bit_for_bit(
 
 @every_network
 @pytest.mark.parametrize("updates", [0, 11])
+@pytest.mark.thinned(2)
 def test_a_block_may_update_a_learner_that_is_then_the_one_before(network_class: type[nn.Module], updates: int) -> None:
     side, shards = _SIDE[network_class], 2 if network_class is DQNCnn else 1
     learner, untouched = (_learner(network_class, precision="bf16", shards=shards, ema=15) for _ in range(2))

@@ -60,6 +60,7 @@ def folder(tiny: Compose, tmp_path: Path) -> Path:
         ("scores", [], "card.json: scores=[]"),
     ],
 )
+@pytest.mark.thinned(3)
 def test_a_folder_that_was_tampered_with_is_one_line(
     command: Command, folder: Path, capsys: pytest.CaptureFixture[str], key: str, value: Any, line: str
 ) -> None:

@@ -202,6 +202,7 @@ def test_a_run_that_cannot_be_compared_is_named(asking: Asking, recorded: Record
         decide(session.request)
 
 
+@pytest.mark.slow
 def test_a_training_that_fails_ends_the_decision_in_one_line_that_says_how_it_goes_on(
     asking: Asking, recorded: Recorded
 ) -> None:

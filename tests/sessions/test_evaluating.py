@@ -65,6 +65,7 @@ def test_no_run_at_all_is_one_line_and_nothing_is_created(
 
 
 @pytest.mark.parametrize("damaged", ["", "{", "[]", '{"model": {}}', '{"model": {"_target_": "os.system"}}'])
+@pytest.mark.thinned(3)
 def test_a_damaged_config_is_one_line_that_names_its_file(
     command: Command, stored: Path, capsys: pytest.CaptureFixture[str], damaged: str
 ) -> None:
@@ -153,6 +154,7 @@ def test_a_persons_episode_is_a_run_that_a_comparison_finds(
     assert [player.config["player"] for player in gather(tmp_path).players] == ["ann", "ann"]
 
 
+@pytest.mark.slow
 def test_the_game_runs_at_60_frames_a_second(pygame: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     speeds = []
     monkeypatch.setattr(

@@ -157,6 +157,7 @@ def test_the_search_for_a_parting_ends(trained: list[Training], folder: Path, mo
 
 
 @pytest.mark.parametrize("which", ["unlike", "nearly_alike"])
+@pytest.mark.thinned(2)
 def test_networks_part_where_a_naive_loop_finds_it(
     which: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -241,6 +242,7 @@ def test_of_many_groups_each_is_compared_with_one(
     assert f"Of 5 groups, networks are compared with that of {first} only." in result.notes
 
 
+@pytest.mark.slow
 def test_compare_asks_why_and_keeps_page_tables_and_films(
     trained: list[Training],
     folder: Path,

@@ -305,6 +305,7 @@ def stranger() -> Iterator[tuple[str, list[tuple[str, str | None]]]]:
 
 
 @pytest.mark.parametrize("what", ["runs SET artifact_uri", "logged_models SET artifact_location"])
+@pytest.mark.thinned(2)
 def test_a_server_cannot_send_the_password_to_another_one(
     what: str,
     tmp_path: Path,
@@ -376,6 +377,7 @@ def test_a_server_out_of_reach_and_a_damaged_folder_are_one_line_each(
     assert "commit.json is damaged" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_server_that_drips_is_given_up(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A byte now and then keeps every single wait short, and a page token keeps every list going."""
     dripped = bytearray()

@@ -97,7 +97,7 @@ def test_the_line_of_a_first_episode_has_no_score_yet() -> None:
         (0.0, 10.0, "0:00:00"),
         (-5.0, 10.0, "0:00:00"),
         (36_005.0, 10.0, "1:00:00"),
-        (864_000.0, 10.0, "1 day, 0:00:00"),
+        (864_000.0, 10.0, "24:00:00"),
     ],
 )
 def test_the_time_left_follows_from_the_pace(steps_left: float | None, steps_per_second: float, left: str) -> None:
