@@ -37,7 +37,7 @@ Command = Callable[..., int]
         (("model=cnn,resnet", "hydra/launcher=joblb"), "In 'hydra/config': Could not find 'hydra/launcher/joblb'"),
     ],
 )
-@pytest.mark.thinned(4)
+@pytest.mark.thinned(8)
 def test_a_question_that_cannot_be_decided_is_one_line_and_code_2_and_leaves_nothing_behind(
     command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], line: str
 ) -> None:

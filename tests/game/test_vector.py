@@ -59,12 +59,12 @@ def test_workers_change_nothing() -> None:
     seeds = [7, 2**40, 3]
     serial = SerialEmulators(make, NUM_ENVS)
     first = serial.reset(range(NUM_ENVS), seeds)
-    played = play(serial, 150, seed=0)
+    played = play(serial, 110, seed=0)
     state = serial.state_dict()
     for workers in (1, 2, 3):
         with ProcessEmulators(make, NUM_ENVS, workers) as processes:
             np.testing.assert_array_equal(processes.reset(range(NUM_ENVS), seeds), first, strict=True)
-            assert_all_equal(play(processes, 150, seed=0), played)
+            assert_all_equal(play(processes, 110, seed=0), played)
             np.testing.assert_equal(processes.state_dict(), state)
 
 

@@ -120,6 +120,7 @@ def frames_of(film: bytes) -> int:
     return len(pictures)
 
 
+@pytest.mark.slow
 def test_a_network_agrees_with_itself_and_never_parts(trained: list[Training], folder: Path) -> None:
     run = trained[0]
     result = probe_groups(folder, {"a": [run], "b": [run]}, None)

@@ -57,6 +57,7 @@ def test_the_forecast_is_measured_before_there_is_anything_for_mlflow(
     assert folder.state == "done"
 
 
+@pytest.mark.slow
 def test_a_forecast_changes_nothing_of_a_training(tiny: Compose, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[float] = []
 
@@ -298,15 +299,9 @@ def test_a_journal_that_was_cut_is_one_clear_line(tiny: Compose) -> None:
         train(Job(tiny("evaluation.at_end=false", "evaluation.every_steps=null")))
 
 
-@pytest.mark.parametrize(
-    ("sampler", "damaged"),
-    [
-        ("prioritized", "newest"),
-        ("uniform", "oldest"),
-        pytest.param("prioritized", "oldest", marks=pytest.mark.slow),
-        pytest.param("uniform", "newest", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.thinned(4)
+@pytest.mark.parametrize("sampler", ["prioritized", "uniform"])
+@pytest.mark.parametrize("damaged", ["newest", "oldest"])
 def test_a_damaged_part_of_the_replay_memory_costs_that_part_and_is_said(
     tiny: Compose, sampler: str, damaged: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -61,7 +61,7 @@ def test_best_of_the_commit_before_is_found_where_the_last_is_damaged(interrupte
 
 
 @pytest.mark.parametrize("verb", ["export to={folder}/new", "evaluate weights=best tracking=none"])
-@pytest.mark.thinned(2)
+@pytest.mark.slow
 def test_a_flipped_byte_is_one_line(
     verb: str, interrupted: RunFolder, command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

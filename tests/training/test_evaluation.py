@@ -37,6 +37,7 @@ def test_an_episode_depends_on_the_seed_and_its_index_alone(played: Callable[...
     assert all(episode.steps == 25 and episode.truncated for episode in alone.episodes)
 
 
+@pytest.mark.slow
 def test_a_network_evaluated_twice_plays_twice_the_same(tiny: Compose, played: Callable[..., Evaluation]) -> None:
     learner = build_learner(tiny())
     actor = EpsilonGreedy(learner.q_values, 4)

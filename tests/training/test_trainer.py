@@ -262,7 +262,7 @@ def test_updates_are_those_that_a_naive_loop_counts(
 
 
 @pytest.mark.parametrize("num_envs", [1, 8])
-@pytest.mark.thinned(2)
+@pytest.mark.slow
 def test_a_prioritized_training_is_the_same_whenever_it_is_committed(
     small: Small, tmp_path: Path, num_envs: int
 ) -> None:
