@@ -1,45 +1,64 @@
 """Damaged and hostile files: whatever a verb reads, it ends in one line, soon, and changes nothing that was there."""
 
+import importlib
+import io
+import json
 import os
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
 
-from atlantis_exp.commands import main
+from atlantis_exp import commands
+from atlantis_exp.commands.app import Asked, Verb
+from atlantis_exp.commands.overrides import check
+from atlantis_exp.faults import Fault
+from atlantis_exp.training.checkpoint import _checksum
 
 PLAYING = ("episodes=1", "evaluation.video=false", "device=cpu")
 VERBS = {
-    "compare": ("compare", "tracking=none"),
+    "compare": ("compare", "by=seed", "tracking=none"),
     "report": ("report",),
     "sync": ("sync",),
-    "evaluate": ("evaluate", "run=cnn", "tracking=none", *PLAYING),
-    "export": ("export", "run=cnn", "to={outputs}/new", *PLAYING),
+    "evaluate": ("evaluate", "run=cnn-uniform-s0", "tracking=none", *PLAYING),
+    "export": ("export", "run=cnn-uniform-s0", "to={outputs}/new", *PLAYING),
+    "best": ("export", "run=cnn-uniform-s0", "weights=best", "to={outputs}/new", *PLAYING),
     "exported": ("evaluate", "weights={outputs}/card", "tracking=none", *PLAYING),
-    "train": (),  # the training itself, again
+    "train": ("train",),  # a training that has ended
+    "continue": ("train", "seed=1"),  # one that a larger budget continues
 }
-OF_A_RUN = ("compare", "report", "sync", "evaluate", "export", "train")
+OF_A_RUN = ("compare", "report", "sync", "evaluate", "export", "best", "train")
 READ_BY = {
-    **{f"runs/*/{name}": OF_A_RUN for name in ("config.json", "result.json", "commit.json", "journal.jsonl")},
-    "runs/*/artifacts/evaluation/000000160.csv": ("compare",),
-    "runs/*/artifacts/models/network/160.safetensors": ("export", "sync"),
-    "runs/*/checkpoints/*/manifest.json": ("evaluate", "export"),
-    "runs/*/checkpoints/*/state.json": ("evaluate", "export"),
-    "runs/*/checkpoints/*/tensors.safetensors": ("evaluate", "export"),
-    "runs/*/published.json": ("report", "sync"),
+    **{f"runs/*s0*/{name}": OF_A_RUN for name in ("config.json", "result.json", "commit.json", "journal.jsonl")},
+    "runs/*s0*/artifacts/evaluation/000000160.csv": ("compare",),
+    "runs/*s0*/artifacts/models/network/160.safetensors": ("best", "sync"),
+    "runs/*s0*/artifacts/images/score/heatmap/0.png": ("sync",),
+    "runs/*s0*/checkpoints/*/manifest.json": ("evaluate", "best"),
+    "runs/*s0*/checkpoints/*/state.json": ("evaluate", "best"),
+    "runs/*s0*/checkpoints/*/tensors.safetensors": ("evaluate",),
+    "runs/*s0*/published.json": ("report", "sync"),
+    **{f"runs/*s1*/{name}": ("continue",) for name in ("config.json", "result.json", "commit.json", "journal.jsonl")},
+    **{f"runs/*s1*/checkpoints/*/{name}": ("continue",) for name in ("manifest.json", "state.json")},
+    **{f"runs/*s1*/checkpoints/*/{name}.safetensors": ("continue",) for name in ("tensors", "arrays")},
+    **{f"runs/*s1*/checkpoints/segments/*/{name}": ("continue",) for name in ("state.json", "arrays.safetensors")},
     "evaluations/*/config.json": ("compare", "sync"),
     "evaluations/*/result.json": ("compare",),
     "evaluations/*/commit.json": ("compare", "sync"),
     "evaluations/*/artifacts/evaluation/episodes.csv": ("compare",),
+    "comparisons/*/looks.json": ("compare",),
     "card/card.json": ("exported",),
     "card/weights.safetensors": ("exported",),
 }
 WAYS = ("deep", "pipe", "folder", "huge", "cut", "", "5", "[]", "{}", "null", '{"kind":"metrics"}', "\x00")
-OWN = ("lock", "holder.txt", "published.json", "published.lock")  # files that verbs may write beside a run's
+OWN = ("lock", "holder.txt", "published.")  # beginnings of files that verbs may write beside a run's
 
 
 class Hangs(BaseException): ...
@@ -50,7 +69,7 @@ def run(*words: str) -> int:
     with pytest.MonkeyPatch.context() as patched, soon():
         patched.setattr(sys, "argv", ["atlantis_exp", *words])
         try:
-            main()
+            commands.main()
         except SystemExit as ended:
             return int(str(ended.code))
     return 0
@@ -81,9 +100,11 @@ def sound(
     mlflow_tables(outputs)
     where = f"paths.outputs={outputs}"
     training = tuple(word for word in tiny_overrides if word != "tracking=none")
-    assert run(*training, where) == 0
-    assert run("evaluate", "run=cnn", "epsilon=0.5", "tracking=none", *PLAYING, where) == 0
-    assert run("export", "run=cnn", f"to={outputs}/card", *PLAYING, where) == 0
+    assert run("train", *training, where) == 0
+    assert run("train", *training, "seed=1", "budget.steps=80", where) == 0
+    assert run("evaluate", "run=cnn-uniform-s0", "evaluation.seed=1", "tracking=none", *PLAYING, where) == 0
+    assert run(*VERBS["compare"], where) == 0
+    assert run("export", "run=cnn-uniform-s0", f"to={outputs}/card", *PLAYING, where) == 0
     return outputs, training
 
 
@@ -98,8 +119,14 @@ def outputs(sound: tuple[Path, tuple[str, ...]], tmp_path: Path) -> Path:
 def contents(outputs: Path) -> dict[str, bytes]:
     """The files of runs, evaluations and the card, but for those that verbs may write."""
     files = [path for place in ("runs", "evaluations", "card") for path in (outputs / place).rglob("*")]
-    own = (path for path in files if path.is_file() and path.name not in OWN and path.stat().st_size < 2**30)
+    own = (path for path in files if path.is_file() and not path.name.startswith(OWN) and path.stat().st_size < 2**30)
     return {str(path): path.read_bytes() for path in own}
+
+
+def words_of(verb: str, training: Sequence[str], outputs: Path) -> list[str]:
+    """The command line of a verb."""
+    words = [word.format(outputs=outputs) for word in VERBS[verb]]
+    return [*words, *(training if words[0] == "train" else ()), f"paths.outputs={outputs}"]
 
 
 def assert_it_ends_in_one_line(
@@ -107,14 +134,13 @@ def assert_it_ends_in_one_line(
 ) -> None:
     before = contents(outputs)
     capsys.readouterr()
-    words = VERBS[verb] or training
-    code = run(*(word.format(outputs=outputs) for word in words), f"paths.outputs={outputs}")
+    code = run(*words_of(verb, training, outputs))
     said = capsys.readouterr().err
     assert code in (0, 1, 2, 75), said
     assert "Traceback" not in said
     assert code == 0 or len([line for line in said.splitlines() if line.startswith("atlantis_exp:")]) >= 1, said
     after = contents(outputs)
-    assert {name: after.get(name) for name in before} == before or verb == "train"
+    assert {name: after.get(name) for name in before} == before or verb == "continue"
 
 
 def damaged(path: Path, how: str) -> None:
@@ -139,7 +165,7 @@ def damaged(path: Path, how: str) -> None:
 
 def hostile(pattern: str, verb: str, how: str) -> object:
     # Of all, a quick choice: nested JSON for one verb that reads the file.
-    is_quick = how == "deep" and verb == READ_BY[pattern][0] and not pattern.startswith("evaluations/")
+    is_quick = how == "deep" and verb == READ_BY[pattern][0] and pattern.startswith(("runs/*s0*", "card"))
     return pytest.param(pattern, verb, how, marks=() if is_quick else pytest.mark.slow)
 
 
@@ -158,3 +184,178 @@ def test_a_hostile_file_is_one_line(
     (path, *_) = sorted(outputs.glob(pattern), reverse=True)
     damaged(path, how)
     assert_it_ends_in_one_line(outputs, sound[1], verb, capsys)
+
+
+# Fuzzed: any change of any of these files, as Hypothesis thinks of them, and any verb that reads it.
+
+NUMBERS = (-1, 0, 1, 2**31, 2**63, 10**400, -(2**63), 0.5, 1e308, -0.0, float("nan"), float("inf"))
+TEXTS = ("", "\x00", "\ud800", "../../../etc/passwd", "/", "a\nb", "[/b]", "$\\frac{", "x" * 10_000, "RUNNING", "1e999")
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.sampled_from((*NUMBERS, *TEXTS)) | st.text(max_size=8) | st.integers(-9, 9),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(("a", "", "kind", "name")), inner),
+    max_leaves=4,
+)
+
+
+def prepared(name: str, *words: str) -> Callable[[], object]:
+    """A verb's work, composed and checked, to be done as often as one likes."""
+    asked: Verb[Any] = importlib.import_module(f"atlantis_exp.commands.{name}").VERB
+    ((overrides, config),) = check(asked.config_name or name, asked.schema, asked.rewrite(list(words))).items()
+    return asked.work(Asked(config, name, overrides, typed=words))
+
+
+@st.composite
+def changed_json(draw: st.DrawFn, content: bytes) -> bytes:
+    """JSON with a node replaced, left out, doubled, or buried."""
+    tree = json.loads(content)
+    nodes: list[tuple[Any, Any]] = []
+
+    def walk(node: Any) -> None:
+        for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+            nodes.append((node, key))
+            if isinstance(value, dict | list):
+                walk(value)
+
+    walk(tree)
+    holder, key = draw(st.sampled_from(nodes)) if nodes else ([tree], 0)
+    match draw(st.sampled_from(("replace", "replace", "remove", "rename", "double", "bury", "whole"))):
+        case "replace":
+            holder[key] = draw(VALUES)
+        case "remove":
+            del holder[key]
+        case "rename" if isinstance(holder, dict):
+            holder[draw(st.sampled_from(TEXTS))] = holder.pop(key)
+        case "double" if isinstance(holder, dict):
+            holder["$twice"] = draw(VALUES)
+            return json.dumps(tree).replace('"$twice"', json.dumps(key)).encode()
+        case "bury":
+            holder[key] = "$deep"
+            depth = draw(st.sampled_from((10, 199, 200, 201, 1_000, 100_000)))
+            return json.dumps(tree).replace('"$deep"', "[" * depth + "]" * depth).encode()
+        case "whole":
+            tree = draw(VALUES)
+    return json.dumps(tree).encode()
+
+
+@st.composite
+def changed_lines(draw: st.DrawFn, content: bytes) -> bytes:
+    """Lines of which one is changed, left out, doubled, or moved."""
+    lines = content.splitlines(keepends=True)
+    index, other = (draw(st.integers(0, len(lines) - 1)) for _ in range(2))
+    match draw(st.sampled_from(("change", "change", "remove", "double", "move", "cell"))):
+        case "change" if lines[index].startswith(b"{"):
+            lines[index] = draw(changed_json(lines[index])) + b"\n"
+        case "remove":
+            del lines[index]
+        case "double":
+            lines.insert(other, lines[index])
+        case "move":
+            lines.insert(other, lines.pop(index))
+        case _:
+            cells = lines[index].rstrip(b"\n").split(b",")
+            cells[draw(st.integers(0, len(cells) - 1))] = str(draw(VALUES)).encode(errors="surrogatepass")
+            lines[index] = b",".join(cells) + b"\n"
+    return b"".join(lines)
+
+
+@st.composite
+def changed_bytes(draw: st.DrawFn, content: bytes) -> bytes:
+    """Bytes of which some are changed, left out, or put in between."""
+    start = draw(st.integers(0, len(content)))
+    stop = draw(st.sampled_from((start, start + 1, start + 8, len(content))))
+    return content[:start] + draw(st.binary(max_size=9)) + content[stop:]
+
+
+@st.composite
+def changed_tensors(draw: st.DrawFn, content: bytes) -> bytes:
+    """Safetensors with another header."""
+    size = int.from_bytes(content[:8], "little")
+    header = draw(changed_json(content[8 : 8 + size]))
+    return len(header).to_bytes(8, "little") + header + content[8 + size :]
+
+
+@st.composite
+def change(draw: st.DrawFn, path: Path) -> bytes:
+    content = path.read_bytes()
+    ways: list[Callable[[bytes], st.SearchStrategy[bytes]]] = [changed_bytes]
+    if path.suffix in (".json", ".jsonl", ".csv", ".safetensors"):
+        ways += 3 * [{".json": changed_json, ".safetensors": changed_tensors}.get(path.suffix, changed_lines)]
+    return draw(draw(st.sampled_from(ways))(content))
+
+
+def sealed(path: Path, content: bytes) -> None:
+    """Make the checksums and lengths that speak of a file true again, as whoever forges it would."""
+    with suppress(ValueError, KeyError, TypeError, AttributeError):  # what is sealed need not have a form
+        if path.name == "journal.jsonl":
+            commit = json.loads((path.parent / "commit.json").read_bytes())
+            (path.parent / "commit.json").write_text(json.dumps({**commit, "offset": len(content)}))
+        if path.parent.name == "card":
+            card = json.loads((path.parent / "card.json").read_bytes())
+            digest = sha256((path.parent / "weights.safetensors").read_bytes()).hexdigest()
+            (path.parent / "card.json").write_text(json.dumps({**card, "sha256": digest}))
+        if (manifest := path.parent / "manifest.json").exists():
+            tree = json.loads(manifest.read_bytes())
+            if path != manifest:
+                tree["state"][path.name] = sha256(content).hexdigest()
+            tree.pop("sha256", None)
+            manifest.write_text(json.dumps({**tree, "sha256": _checksum(tree)}))
+
+
+@pytest.fixture(scope="module")
+def fuzzed(sound: tuple[Path, tuple[str, ...]], tmp_path_factory: pytest.TempPathFactory) -> Callable[..., None]:
+    """Puts a content in a file's place, calls a verb, and asserts that it ends well."""
+    whole, training = sound
+    outputs = tmp_path_factory.mktemp("fuzzed") / "outputs"
+    works = {verb: prepared(*words_of(verb, training, outputs)) for verb in VERBS}
+    places = ("runs", "evaluations", "comparisons", "card", "new")
+
+    def call(pattern: str, verb: str, content: bytes, is_forged: bool) -> None:
+        for place in places:
+            shutil.rmtree(outputs / place, ignore_errors=True)
+        shutil.copytree(whole, outputs, dirs_exist_ok=True, ignore=shutil.ignore_patterns("mlflow.db*"))
+        (path, *_) = sorted(outputs.glob(pattern), reverse=True)
+        path.write_bytes(content)
+        if is_forged:
+            sealed(path, content)
+        before = contents(outputs)
+        said = io.StringIO()
+        with soon(), redirect_stderr(said), redirect_stdout(io.StringIO()):
+            try:
+                works[verb]()
+            except (Fault, OSError) as fault:
+                print(f"atlantis_exp: {fault}", file=sys.stderr)
+        lines = said.getvalue().splitlines()
+        assert not any(line.startswith((" ", "Traceback")) for line in lines), lines  # each a line of its own
+        after = contents(outputs)
+        assert {name: after.get(name) for name in before} == before or verb == "continue"
+
+    return call
+
+
+FUZZED = sorted((pattern, verb) for pattern, verbs in READ_BY.items() for verb in verbs)
+
+
+@pytest.mark.parametrize(
+    ("examples", "verbs"),
+    [(12, ("report", "export", "exported", "train")), pytest.param(1_000, tuple(VERBS), marks=pytest.mark.slow)],
+)
+@pytest.mark.timeout(7_200)
+def test_a_changed_file_is_one_line(
+    examples: int, verbs: Sequence[str], fuzzed: Callable[..., None], sound: tuple[Path, tuple[str, ...]]
+) -> None:
+    read_by_them = [(pattern, verb) for pattern, verb in FUZZED if verb in verbs]
+
+    @settings(
+        max_examples=examples,
+        derandomize=True,
+        deadline=None,
+        database=None,
+        phases=(Phase.explicit, Phase.generate, Phase.target),
+    )
+    @given(st.data())
+    def changed(data: st.DataObject) -> None:
+        pattern, verb = data.draw(st.sampled_from(read_by_them))
+        (path, *_) = sorted(sound[0].glob(pattern), reverse=True)
+        fuzzed(pattern, verb, data.draw(change(path)), data.draw(st.booleans()))
+
+    changed()

@@ -1,5 +1,9 @@
-"""Files of run folders: put in place whole, and read within bounds, since whatever is read may be anybody's."""
+"""Files of run folders: put in place whole, and read within bounds, since whatever is read may be anybody's.
 
+No link is followed: it would lead to a file of whoever reads or writes here.
+"""
+
+import errno
 import hashlib
 import os
 import stat
@@ -15,8 +19,13 @@ CHECKPOINT = 2**36  # bytes, of a whole replay memory
 
 def open_file(path: Path) -> BinaryIO:
     """Open a regular file for reading. Raises: OSError, ValueError where it is of another kind."""
-    # Without blocking: a pipe would wait until somebody writes to it.
-    file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+    try:
+        # Without blocking: a pipe would wait until somebody writes to it.
+        file = open(path, "rb", opener=lambda name, flags: no_link(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise ValueError(f"{path} is no regular file, but a link") from None
+        raise
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
         raise ValueError(f"{path} is no regular file")
@@ -29,6 +38,20 @@ def read_file(path: Path, most: int) -> bytes:
         if (size := os.fstat(file.fileno()).st_size) > most:
             raise ValueError(f"{path} has {size:,} bytes, more than {most:,}")
         return file.read()
+
+
+def no_link(path: str, flags: int) -> int:
+    """Open a file that is no symbolic link, as `opener` of `open`. Raises: OSError."""
+    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
+
+
+def inside(folder: Path, path: str) -> Path:
+    """The file in a folder of a run that a path names. Raises: ValueError where it, or a link, leads out of it."""
+    root = folder.parent.resolve() / folder.name
+    file = (root / path).resolve()
+    if root not in file.parents:
+        raise ValueError(f"The path {path!r} does not name a file inside {root}")
+    return file
 
 
 def is_whole(content: bytes, sha256: str) -> bool:
@@ -48,7 +71,7 @@ def write_file(path: Path, content: bytes) -> None:
     """Put a file in place whole, durably, or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(path.name + ".aside")
-    with open(aside, "wb") as file:
+    with open(aside, "wb", opener=no_link) as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())

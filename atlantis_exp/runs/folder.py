@@ -14,7 +14,7 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.runs import lock
-from atlantis_exp.runs.files import SMALL, read_file, write_file
+from atlantis_exp.runs.files import SMALL, inside, read_file, write_file
 from atlantis_exp.runs.journal import Commit, Status, read_commit
 
 CONFIG, RESULT, COMMIT = "config.json", "result.json", "commit.json"
@@ -86,8 +86,8 @@ class RunFolder:
         return self.path / CHECKPOINTS
 
     def artifact(self, name: str) -> Path:
-        """A file that the journal names."""
-        return self.path / "artifacts" / name
+        """A file that the journal names. Raises: ValueError where it leads out of the folder."""
+        return inside(self.path / "artifacts", name)
 
     @property
     def has_started(self) -> bool:

@@ -20,7 +20,7 @@ from uuid import uuid4
 from pydantic import TypeAdapter, ValidationError
 
 from atlantis_exp.faults import Fault
-from atlantis_exp.runs.files import SMALL, open_file, read_file, read_object, write_file
+from atlantis_exp.runs.files import SMALL, inside, no_link, open_file, read_file, read_object, write_file
 
 Status = Literal["SCHEDULED", "RUNNING", "FINISHED", "FAILED", "KILLED"]
 NOTE = "mlflow.note.content"
@@ -52,9 +52,10 @@ class Tags:
 
 @dataclass(frozen=True)
 class Artifact:
-    """A file under `artifacts/`."""
+    """A file under `artifacts/`, with its SHA-256: the one on disk may be newer than the last commit."""
 
     path: str
+    sha256: str = ""  # empty in journals of 0.1.0
 
 
 @dataclass(frozen=True)
@@ -212,19 +213,19 @@ class Journal:
         self.tags({NOTE: markdown})
 
     def artifact(self, path: str, content: bytes) -> None:
-        write_file(_inside(self._folder, path), content)
-        self._append(Artifact(path))
+        write_file(inside(self._folder / "artifacts", path), content)
+        self._append(Artifact(path, hashlib.sha256(content).hexdigest()))
 
     def image(self, key: str, content: bytes, step: int) -> None:
         path = f"images/{_name(key)}/{step}.png"
-        write_file(_inside(self._folder, path), content)
+        write_file(inside(self._folder / "artifacts", path), content)
         self._append(Image(key, step, self._time, path))
 
     def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None:
         if set("/.") & set(name):
             raise ValueError(f"A model's name holds neither '/' nor '.': {name!r}")
         path = model_file(_name(name), step)
-        write_file(_inside(self._folder, path), content)
+        write_file(inside(self._folder / "artifacts", path), content)
         digest = hashlib.sha256(content).hexdigest()
         # MLflow charts a model's metrics on the run as well: with the time of the metrics just recorded they are the
         # same points, not second ones.
@@ -251,7 +252,7 @@ class Journal:
         if self._offset < self._commit.offset:
             self._mark(replace(self._commit, offset=self._offset))  # readers first: the bytes change under them next
         content = b"".join(self._lines)
-        with open(self._folder / "journal.jsonl", "ab") as file:
+        with open(self._folder / "journal.jsonl", "ab", opener=no_link) as file:
             file.truncate(self._offset)
             file.write(content)
             file.flush()
@@ -277,7 +278,8 @@ class Journal:
     def _mark(self, commit: Commit) -> None:
         # What was visible cannot be unsent: a journal that goes back behind its commit is a new run to its readers.
         identity = self._commit.identity if commit.offset >= self._commit.offset else uuid4().hex
-        self._commit = replace(commit, identity=identity, updated=_now())
+        # Whatever a clock that was set back says: no run ends before it began.
+        self._commit = replace(commit, identity=identity, updated=max(_now(), self._time, self._commit.updated))
         _write_commit(self._folder, self._commit)
 
 
@@ -331,7 +333,7 @@ def restore(folder: Path, start: int, pieces: Iterable[bytes]) -> None:
     The caller holds the folder, and what is committed in it ends at `start` or before.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / "journal.jsonl", "ab") as file:
+    with open(folder / "journal.jsonl", "ab", opener=no_link) as file:
         file.truncate(start)
         file.writelines(pieces)
         file.flush()
@@ -359,7 +361,7 @@ def read(folder: Path, start: int = 0, end: int | None = None) -> Iterator[tuple
             line = _line(file, start, end)
             record = record_of(line, f"{file.name}, byte {start}")
             if isinstance(record, Artifact | Image | Model):
-                _inside(folder, record.path)
+                inside(folder / "artifacts", record.path)
             start += len(line)
             yield start, record
 
@@ -431,14 +433,6 @@ def _unborn() -> Commit:
 
 def _write_commit(folder: Path, commit: Commit) -> None:
     write_file(folder / "commit.json", commit_bytes(commit))
-
-
-def _inside(folder: Path, path: str) -> Path:
-    root = (folder / "artifacts").resolve()
-    file = (root / path).resolve()
-    if root not in file.parents:
-        raise ValueError(f"The path {path!r} does not name a file inside {root}")
-    return file
 
 
 @lru_cache(maxsize=4096)

@@ -17,8 +17,10 @@ def held(folder: Path, name: str, seconds: float) -> Iterator[None]:
     """Hold a folder, which is made if need be, after waiting for it as long as that.
 
     Raises:
-        Fault: naming the process that holds it; exit code 75.
+        Fault: naming the process that holds it, exit code 75; or a link, through which something else would be written.
     """
+    if (link := _link(folder)) is not None:
+        raise Fault(f"{name}: {link} is a link, which is not written through; put what it leads to in its place")
     folder.mkdir(parents=True, exist_ok=True)
     try:
         lock = FileLock(folder / "lock").acquire(seconds)
@@ -28,6 +30,12 @@ def held(folder: Path, name: str, seconds: float) -> Iterator[None]:
     with lock:
         (folder / _HOLDER).write_text(f"process {os.getpid()} on {os.uname().nodename}\n")
         yield
+
+
+def _link(folder: Path) -> Path | None:
+    """A folder itself or what is in it, if that is a symbolic link; Optuna's locks are."""
+    places = (Path(above, name) for above, folders, files in os.walk(folder) for name in (*folders, *files))
+    return next((path for path in (folder, *places) if path.suffix != ".lock" and path.is_symlink()), None)
 
 
 def is_held(folder: Path) -> bool:

@@ -52,18 +52,18 @@ def read_card(folder: Path) -> tuple[Card, bytes]:
         ConfigError: without such a folder, or with a card that is none.
         Fault: where the weights are not the card's.
     """
-    path = folder / "card.json"
+    path = folder / "card.json"  # may be a link, as in a cache of downloads: somebody named this very folder
     if not path.is_file():
         others = {str(card.parent) for card in folder.parent.glob("*/card.json")}
         raise ConfigError(
             f"weights={folder}: no folder with a card.json; {nearest(str(folder), {'latest', 'best'} | others)}"
         )
     try:
-        card = parse(Card, read_object(read_file(path, SMALL)))
+        card = parse(Card, read_object(read_file(path.resolve(), SMALL)))
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: {error}") from None
     try:
-        weights = read_file(folder / "weights.safetensors", MOST_BYTES)
+        weights = read_file((folder / "weights.safetensors").resolve(), MOST_BYTES)
     except (OSError, ValueError) as error:
         raise Fault(f"{folder}: its weights cannot be read: {error}") from None
     if hashlib.sha256(weights).hexdigest() != card.sha256:

@@ -33,6 +33,7 @@ from atlantis_exp.checking import digest
 from atlantis_exp.config import TrackingConfig
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
+from atlantis_exp.runs.files import ARTIFACT, read_file
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal, Metrics, adopt, read
 from atlantis_exp.runs.lock import alone
@@ -124,8 +125,8 @@ def _open(request: Request) -> "_Session":
         folder.write_config(facts)
         after = request.pruned_after
         file = folder.path / "trials.jsonl"
-        _mend(file)
         try:
+            _mend(file)
             study = optuna.create_study(
                 storage=JournalStorage(JournalFileBackend(str(file))),
                 study_name=name,
@@ -133,8 +134,14 @@ def _open(request: Request) -> "_Session":
                 pruner=NopPruner() if after is None else MedianPruner(after, request.spared + 1),
                 load_if_exists=True,
             )
-        except (ValueError, KeyError) as error:
-            raise Fault(f"{file} is damaged ({error}); the trials' runs are not") from None
+        except OSError:
+            raise
+        except Exception as error:  # Optuna checks nothing of what it reads
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            raise Fault(
+                f"{file} is damaged ({reason}): restore it, or begin anew with another name=, which finds the trials' "
+                "runs where it draws the same values"
+            ) from None
     return _Session(request, folder, study)
 
 
@@ -145,7 +152,7 @@ def _mend(file: Path) -> None:
     lock = JournalFileSymlinkLock(str(file))  # the one that all processes write under
     lock.acquire()
     try:
-        content = file.read_bytes()
+        content = read_file(file, ARTIFACT)
         os.truncate(file, content.rfind(b"\n") + 1)
     finally:
         lock.release()

@@ -19,6 +19,7 @@ from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.job import Job, labels
 from atlantis_exp.sessions.stopping import StopRequest, sweep_goes_on
 from atlantis_exp.tracking.publishing import catch_up, publishing
+from atlantis_exp.training.checkpoint import unforged
 from atlantis_exp.training.forecast import Forecast, forecast
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Outcome, Trainer
@@ -94,7 +95,8 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
     config = job.config
     state = trainer.checkpoints.load(trainer.memory, progress.say)
     folder.write_config(to_dict(config))
-    steps_done = 0 if state is None else state["counters"]["steps"]
+    with unforged(folder.checkpoints):
+        steps_done = 0 if state is None else int(state["counters"]["steps"])
     if state is None:
         progress.say(f"starting run {folder.name} in {folder.path}")
     else:
@@ -109,7 +111,8 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
         journal.artifact(CONFIG, (folder.path / CONFIG).read_bytes())
         journal.tags({"flops_per_update": str(flops)})
     else:
-        trainer.load_state_dict(state)
+        with unforged(folder.checkpoints):
+            trainer.load_state_dict(state)
     if lost := trainer.checkpoints.lost:
         journal.tags({LOST: f"{lost:,} observations of the replay memory, at step {steps_done:,}"})
     facts = {

@@ -9,7 +9,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import Protocol
 
 from atlantis_exp.build import build_memory
 from atlantis_exp.checking import flatten, to_dict
@@ -23,6 +25,7 @@ from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.fingerprint import fingerprint
 
 _KILLS = 3
+_SAID = "stderr.txt"  # of the latest session
 
 
 def verify_resume(job: Job) -> None:
@@ -66,41 +69,56 @@ def train_and_kill(config: Config, overrides: Sequence[str], outputs: Path, kill
     # When commits happen changes nothing, and without one there is nothing to continue from.
     own = (f"paths.outputs={outputs}", "tracking.commit_seconds=1.0", "resume=auto")
     command = (sys.executable, "-m", "atlantis_exp", "train", *replaced(overrides, *own))
-    folder = outputs / "runs" / config.run_name()
-    return run_and_kill(command, outputs, lambda: _generation(folder), kills)
+    return run_and_kill(lambda said: start(command, said), outputs, config.run_name(), kills)
 
 
-def run_and_kill(
-    command: Sequence[str], outputs: Path, commits: Callable[[], int], kills: int, *, with_children: bool = False
-) -> int:
-    """Run a command that writes `outputs` to its end, with a SIGKILL at a random moment after a commit, `kills` times.
+class Session(Protocol):
+    """A process that trains."""
 
-    Returns how many struck. commits: how many there are so far; with_children: the command's other processes are killed
-    together with it.
+    pid: int
+
+    def poll(self) -> int | None:
+        """Its exit code, None while it runs."""
+
+    def wait(self) -> int:
+        """Its exit code, once it has ended."""
+
+
+def start(command: Sequence[str], said: Path) -> Session:
+    """Start a command in a process group of its own; what it says on stderr goes to a file."""
+    with open(said, "wb") as file:
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=file, start_new_session=True)
+
+
+def run_and_kill(start: Callable[[Path], Session], outputs: Path, runs: str, kills: int, seconds: float = 1.0) -> int:
+    """Start sessions that write runs under `outputs` until one ends by itself; returns how many kills struck.
+
+    Up to `kills` times, a session's process group gets a SIGKILL at a random moment within some seconds of a commit.
+
+    Args:
+        start: starts a session, the leader of a process group, whose errors go to the file that is handed in.
+        runs: the pattern of the runs' names.
 
     Raises:
         Fault: a session ended with an error.
     """
     struck = 0
+    outputs.mkdir(parents=True, exist_ok=True)
     while True:
-        before = commits()
-        session = subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=with_children
-        )
+        before = _commits(outputs, runs)
+        session = start(outputs / _SAID)
         while struck < kills and session.poll() is None:
             time.sleep(0.01)
-            if commits() > before:
-                time.sleep(random.random())
-                if with_children:
+            if _commits(outputs, runs) > before:
+                time.sleep(random.random() * seconds)
+                with suppress(ProcessLookupError):  # it has just ended
                     os.killpg(session.pid, signal.SIGKILL)
-                else:
-                    session.kill()
                 struck += session.wait() == -signal.SIGKILL
                 break
         else:
-            error = session.communicate()[1]
-            if session.returncode:
-                raise Fault(f"a session under {outputs} failed: {error.strip().splitlines()[-1]}")
+            if session.wait():
+                error = (outputs / _SAID).read_text().strip().splitlines()
+                raise Fault(f"a session under {outputs} failed: {error[-1] if error else 'it said nothing'}")
             return struck
 
 
@@ -114,5 +132,10 @@ def fingerprints(config: Config, outputs: Path) -> dict[str, str]:
     return fingerprint(state, memory, folder.path)
 
 
-def _generation(folder: Path) -> int:
-    return max((int(path.parent.name) for path in folder.glob("checkpoints/0*/manifest.json")), default=0)
+def _commits(outputs: Path, runs: str) -> int:
+    """The generations of all checkpoints of some runs so far."""
+    newest: dict[Path, int] = {}
+    for path in outputs.glob(f"runs/{runs}/checkpoints/0*/manifest.json"):
+        run, generation = path.parents[2], int(path.parent.name)
+        newest[run] = max(newest.get(run, 0), generation)
+    return sum(newest.values())

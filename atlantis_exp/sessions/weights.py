@@ -6,7 +6,7 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import ARTIFACT, is_whole, read_file
 from atlantis_exp.runs.folder import NETWORK, RunFolder
 from atlantis_exp.runs.journal import Model, model_file, read
-from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints
+from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints, unforged
 
 
 def stored_weights(run: RunFolder, weights: str) -> tuple[bytes, int]:
@@ -27,10 +27,11 @@ def stored_weights(run: RunFolder, weights: str) -> tuple[bytes, int]:
         if not stored:
             raise Fault(f"run {run.name} has neither a checkpoint nor an evaluation yet")
         return _read(run, stored[-1].path, stored[-1].sha256), stored[-1].step
-    if weights == "latest":
-        learner = state["learner"]
-        return safetensors.torch.save(learner.get("evaluated", learner["network"])), int(state["counters"]["steps"])
-    step = int(state["best_step"])
+    with unforged(run.checkpoints):
+        if weights == "latest":
+            learner = state["learner"]
+            return safetensors.torch.save(learner.get("evaluated", learner["network"])), int(state["counters"]["steps"])
+        step = int(state["best_step"])
     if step < 0:
         raise Fault(f"run {run.name} has no evaluation yet, so no best weights; weights=latest has some")
     return _read(run, model_file(NETWORK, step), state.get("best_sha256", "")), step
@@ -38,9 +39,8 @@ def stored_weights(run: RunFolder, weights: str) -> tuple[bytes, int]:
 
 def _read(run: RunFolder, path: str, sha256: str) -> bytes:
     """An artifact with weights. Raises: Fault."""
-    file = run.artifact(path)
     try:
-        content = read_file(file, ARTIFACT)
+        content = read_file(file := run.artifact(path), ARTIFACT)
     except (OSError, ValueError) as error:
         raise Fault(f"run {run.name}: its weights cannot be read: {error}") from None
     if not is_whole(content, sha256):

@@ -341,6 +341,8 @@ class Publisher:
                     reason = f"{type(error).__name__}: {error}".partition("\n")[0]
                     _log.warning("Publishing to MLflow fails (%s); the run goes on and is published later", reason)
                 delay, failing = min(2 * delay, 60.0), True
+                if draining and isinstance(error, ValueError):
+                    return  # a damaged folder, which no waiting mends
             else:
                 if failing:
                     _log.warning("Publishing to MLflow works again and is up to date")
@@ -552,7 +554,7 @@ class _Mirror:
         if commit.error:
             tags["error"] = commit.error
             if self._traceback.exists():
-                self._client.log_artifact(self._run_id, str(self._traceback))
+                self._send_file(TRACEBACK, read_file(self._traceback, SMALL))
         elif "error" in self._client.get_run(self._run_id).data.tags:
             self._client.delete_tag(self._run_id, "error")
         self._send_tags(tags)
@@ -561,10 +563,11 @@ class _Mirror:
         if isinstance(record, Artifact | Image | Model) and not (self._artifacts / record.path).is_file():
             _log.warning("%s is gone and cannot be published", self._artifacts / record.path)
             return
-        if isinstance(record, Model) and not is_whole(
+        if isinstance(record, Artifact | Model) and not is_whole(
             read_file(self._artifacts / record.path, ARTIFACT), record.sha256
         ):
-            _log.warning("%s is not what was recorded and is not published", self._artifacts / record.path)
+            if isinstance(record, Model):  # else it is newer than this record, and has, or will have, one of its own
+                _log.warning("%s is not what was recorded and is not published", self._artifacts / record.path)
             return
         match record:
             case Params(values):

@@ -3,8 +3,8 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +16,28 @@ from safetensors import SafetensorError
 
 from atlantis_exp.faults import Fault
 from atlantis_exp.replay.memory import ReplayMemory
-from atlantis_exp.runs.files import CHECKPOINT, SMALL, read_file, read_object, write_file
+from atlantis_exp.runs.files import CHECKPOINT, SMALL, inside, read_file, read_object, write_file
 
 FORMAT = 1
 _SEGMENTS = 64  # of a full memory, about
+_DAMAGED = (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RuntimeError, SafetensorError)
+"""What comes of a state that is not what was saved."""
 
 
 class CheckpointError(Fault):
     """No checkpoint that could be continued from, although there is one; says which and why."""
+
+
+@contextmanager
+def unforged(folder: Path) -> Iterator[None]:
+    """Take a state apart in the block. Raises: CheckpointError where it holds something else than was saved."""
+    try:
+        yield
+    except Fault:
+        raise
+    except _DAMAGED as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise CheckpointError(f"the checkpoint in {folder} is none of this training ({reason})") from None
 
 
 class Checkpoints:
@@ -101,12 +115,14 @@ class Checkpoints:
                     raise ValueError("its manifest does not have its checksum")
                 self._refuse_foreign(manifest, generation)
                 state = self._read(_name(generation), manifest["state"])
-                segments = manifest["segments"]
+                segments = [_segment(entry) for entry in manifest["segments"]]
                 if memory is not None and not may_lose:
                     memory.load_segments(self._read(entry["name"], entry["sha256"]) for entry in segments)
                 elif memory is not None:
                     segments = self._load_what_is_left(memory, segments)
-            except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
+            except CheckpointError:
+                raise
+            except _DAMAGED as error:
                 faults.append(f"checkpoint {generation} in {self.folder} is damaged ({error})")
                 continue
             self._segments, self._generation = segments, generation
@@ -117,7 +133,7 @@ class Checkpoints:
         """Restore the segments behind the last damaged one, and return them."""
         whole: list[dict[str, Any]] = []
         contents: list[dict[str, Any]] = []
-        with suppress(OSError, ValueError, KeyError, TypeError, SafetensorError):
+        with suppress(*_DAMAGED):
             for entry in reversed(segments):
                 contents.insert(0, self._read(entry["name"], entry["sha256"]))
                 whole.insert(0, entry)
@@ -158,9 +174,9 @@ class Checkpoints:
         return {file: hashlib.sha256(content).hexdigest() for file, content in files.items()}
 
     def _read(self, name: str, checksums: Mapping[str, str]) -> dict[str, Any]:
-        if not set(checksums) <= {"state.json", "tensors.safetensors", "arrays.safetensors"} or ".." in name:
+        if not set(checksums) <= {"state.json", "tensors.safetensors", "arrays.safetensors"}:
             raise ValueError("its manifest names files that no checkpoint has")
-        contents = {file: read_file(self.folder / name / file, CHECKPOINT) for file in checksums}
+        contents = {file: read_file(inside(self.folder, f"{name}/{file}"), CHECKPOINT) for file in checksums}
         for file, content in contents.items():
             if hashlib.sha256(content).hexdigest() != checksums[file]:
                 raise ValueError(f"{name}/{file} does not have its checksum")
@@ -181,6 +197,12 @@ class Checkpoints:
 
 def _checksum(manifest: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
+
+
+def _segment(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """A segment as a manifest names it. Raises: KeyError, TypeError, ValueError."""
+    since, next_id = int(entry["since"]), int(entry["next_id"])
+    return {"name": str(entry["name"]), "since": since, "next_id": next_id, "sha256": dict(entry["sha256"])}
 
 
 def _name(generation: int) -> str:

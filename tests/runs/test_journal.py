@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from atlantis_exp.runs.files import write_file
+from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import (
     Artifact,
     Image,
@@ -80,7 +81,7 @@ def test_what_is_committed_is_read_back_in_its_order(tmp_path: Path, clock: Call
             *("best", 7, 1_500, "models/best/7.safetensors", {"train/score": 200.0}),
             sha256=hashlib.sha256(b"weights").hexdigest(),
         ),
-        Artifact("report/index.html"),
+        Artifact("report/index.html", hashlib.sha256(b"<p>").hexdigest()),
     ]
     assert [
         (tmp_path / "artifacts" / path).read_bytes() for path in ("images/q/values/7.png", "report/index.html")
@@ -333,6 +334,29 @@ def test_a_file_that_cannot_be_written_leaves_the_one_before_it(tmp_path: Path) 
     with pytest.raises(TypeError):
         write_file(tmp_path / "a", "not bytes")  # type: ignore[arg-type]
     assert (tmp_path / "a").read_bytes() == b"before"
+
+
+@pytest.mark.parametrize("name", ["journal.jsonl", "commit.json", "commit.json.aside", "artifacts"])
+def test_a_link_in_a_run_folder_is_neither_read_nor_written_through(tmp_path: Path, name: str) -> None:
+    folder, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    journaled(folder, 1)
+    elsewhere.mkdir()
+    (elsewhere / "file").write_text("mine")
+    (folder / name).unlink(missing_ok=True)
+    (folder / name).symlink_to(elsewhere if name == "artifacts" else elsewhere / "file")
+
+    def write() -> None:
+        journal = Journal(folder)
+        journal.artifact("file", b"theirs")
+        journal.flush()
+
+    with pytest.raises((OSError, ValueError)):
+        write()
+    if name == "artifacts":
+        with pytest.raises(ValueError, match="inside"):
+            RunFolder(folder).artifact("file")
+    assert [path.name for path in elsewhere.iterdir()] == ["file"]
+    assert (elsewhere / "file").read_text() == "mine"
 
 
 @pytest.mark.parametrize("path", ["/etc/passwd", "../journal.jsonl", "a/../../b", "link/x", "", "."])

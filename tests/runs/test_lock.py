@@ -48,6 +48,17 @@ def test_a_folder_that_another_process_holds_is_refused_with_its_name(tmp_path: 
     assert not is_held(tmp_path)
 
 
+@pytest.mark.parametrize("link", ["", "checkpoints", "a/b/c"])
+def test_a_folder_with_a_link_is_not_held_for_writing(tmp_path: Path, link: str) -> None:
+    folder, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (folder / link).parent.mkdir(parents=True, exist_ok=True)
+    (folder / link).symlink_to(elsewhere)
+    with pytest.raises(Fault, match=f"run x: {folder / link} is a link"), held(folder, "run x", 0.0):
+        pass
+    assert not list(elsewhere.iterdir())
+
+
 def test_a_folder_is_free_once_its_holder_is_killed(tmp_path: Path) -> None:
     with holder(tmp_path) as process:
         process.send_signal(signal.SIGKILL)

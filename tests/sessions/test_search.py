@@ -116,6 +116,43 @@ def test_a_trial_that_nobody_holds_goes_on_before_a_new_one_is_drawn(searching: 
         assert new.params != trial.params
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        *(b"garbage", b"5", b"{}", b"null", b"\xff\xfe", b'{"op_code":99,"worker_id":"x"}'),
+        b'{"a":' * 20_000 + b"1" + b"}" * 20_000,
+        b'{"op_code":6,"worker_id":"x","trial_id":0,"state":1,"values":"a"}',
+    ],
+    ids=lambda line: line[:20].decode(errors="replace"),
+)
+def test_a_damaged_record_of_the_trials_is_one_line_and_loses_no_other_line(searching: Searching, line: bytes) -> None:
+    session = session_of(searching, "trials=3")
+    with session.claimed():
+        pass
+    file = session.folder.path / "trials.jsonl"
+    content = file.read_bytes()
+    file.write_bytes(content + line + b"\n")
+    with pytest.raises(Fault, match=f"{file} is damaged") as fault:
+        _open(session.request)
+    assert "\n" not in str(fault.value)
+    assert file.read_bytes().startswith(content)
+
+
+def test_a_record_of_the_trials_that_is_a_link_or_a_pipe_is_one_line(searching: Searching, tmp_path: Path) -> None:
+    session = session_of(searching, "trials=3")
+    file = session.folder.path / "trials.jsonl"
+    (tmp_path / "mine").write_text("mine")
+    for is_link in (True, False):
+        file.unlink()
+        if is_link:
+            file.symlink_to(tmp_path / "mine")
+        else:
+            os.mkfifo(file)
+        with pytest.raises(Fault, match="is no regular file"):
+            _open(session.request)
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
 def test_what_is_drawn_depends_on_the_number_of_the_trial_and_those_before_alone(searching: Searching) -> None:
     request, drawn = searching(space=SPACE[1:]), []
     for name in ("a", "b"):

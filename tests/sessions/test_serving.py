@@ -19,10 +19,11 @@ from hydra import compose, initialize_config_dir
 
 from atlantis_exp.commands.composing import CONF, checked
 from atlantis_exp.config import Config
+from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.sweep import ledger
 from atlantis_exp.sessions.training import train
-from atlantis_exp.tracking.store import Store
+from atlantis_exp.tracking.store import Store, publish
 
 REPOSITORY = Path(__file__).parents[2]
 pytestmark = pytest.mark.slow
@@ -83,6 +84,36 @@ def address(outputs: Path, free_port: Callable[[], int], answering: Callable[...
     yield shown
     os.killpg(server.pid, signal.SIGKILL)
     server.wait()
+
+
+def test_the_server_listens_on_this_machine_alone(address: str) -> None:
+    port = int(re.findall(r":(\d+)/", address)[0])
+    tables = [Path("/proc/net", name).read_text().splitlines()[1:] for name in ("tcp", "tcp6")]
+    listening = [line.split()[1] for table in tables for line in table if line.split()[3] == "0A"]
+    assert [place for place in listening if place.endswith(f":{port:04X}")] == [f"0100007F:{port:04X}"]
+
+
+SCRIPT = "<script>attacked=1</script><img src=x onerror=attacked=1>`<svg/onload=attacked=1> [a](javascript:attacked=1)"
+
+
+def test_no_text_of_a_run_runs_a_script_in_mlflows_pages(page: Any, address: str, outputs: Path) -> None:
+    folder = outputs / "runs" / SCRIPT.replace("/", "-")
+    journal = Journal(folder, {"mlflow.runName": SCRIPT, "group": SCRIPT, "atlantis.kind": "training"})
+    journal.params({"model.name": SCRIPT})
+    journal.tags({"command": SCRIPT})
+    journal.note(f"{SCRIPT}\n\n| {SCRIPT} |\n| --- |\n| {SCRIPT} |")
+    journal.flush()
+    journal.status("FAILED", SCRIPT)
+    publish(folder, Store(outputs))
+    (run,) = [run.run_id for run in Store(outputs).runs() if run.name == SCRIPT]
+    runs = address.partition("?")[0]
+    for place in (address, f"{runs}/{run}"):
+        page.goto("about:blank")
+        page.goto(place)
+        page.get_by_text("attacked=1").first.wait_for(state="attached")
+        page.wait_for_timeout(1_000)  # ms, in which a picture is not found
+        assert page.evaluate("typeof attacked") == "undefined", place
+        assert page.locator("a[href^=javascript]").count() == 0, place
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@ import dataclasses
 import json
 import os
 import re
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -265,6 +266,85 @@ def test_a_full_disk_is_one_clear_line_and_costs_nothing_committed(tiny: Compose
     unbroken = tiny(*chosen)
     train(Job(unbroken))
     assert fingerprints(config, small_disk) == fingerprints(unbroken, Path(unbroken.paths.outputs))
+
+
+@pytest.fixture
+def failing_disk(tmp_path: Path) -> Iterator[Path]:
+    """An ext4 file system on a file, where mounting one is allowed."""
+    image, disk = tmp_path / "disk.img", tmp_path / "disk"
+    disk.mkdir()
+    image.touch()
+    os.truncate(image, 2**26)
+    for command in (("mkfs.ext4", "-q", str(image)), ("mount", "-o", "loop", str(image), str(disk))):
+        if shutil.which(command[0]) is None or subprocess.run(command, capture_output=True, check=False).returncode:
+            pytest.skip(f"may not {' '.join(command[:3])}")
+    yield disk
+    subprocess.run(("umount", str(disk)), check=True)
+
+
+@pytest.mark.slow
+def test_a_disk_that_becomes_read_only_is_one_clear_line_and_costs_nothing_committed(
+    tiny: Compose, tiny_overrides: tuple[str, ...], failing_disk: Path
+) -> None:
+    chosen = ("phase.quick.steps=2_000", "evaluation.every_steps=null", "tracking.commit_seconds=0.2")
+    config = at(tiny(*chosen), failing_disk)
+    folder = RunFolder.of(config)
+    running = session(config, tiny_overrides, *chosen)
+    wait_for(lambda: generation(folder) > 1)
+    subprocess.run(("mount", "-o", "remount,abort", str(failing_disk)), check=True)  # as after an error of the disk
+    _, error = running.communicate()
+    assert running.returncode == 1
+    (line,) = error.strip().splitlines()
+    assert re.search(r"^atlantis_exp: run .*Read-only file system.*; continue with: ", line)
+    device = str(failing_disk.parent / "disk.img")
+    subprocess.run(("umount", str(failing_disk)), check=True)
+    subprocess.run(("e2fsck", "-fy", device), check=False, capture_output=True)
+    subprocess.run(("mount", "-o", "loop", device, str(failing_disk)), check=True)
+    assert generation(folder) > 0
+    train(Job(config))
+    unbroken = tiny(*chosen)
+    train(Job(unbroken))
+    assert fingerprints(config, failing_disk) == fingerprints(unbroken, Path(unbroken.paths.outputs))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("faketime") is None, reason="faketime is not installed")
+def test_a_clock_that_jumps_by_a_day_changes_no_duration_and_ends_nothing(
+    tiny: Compose, tiny_overrides: tuple[str, ...], tmp_path: Path
+) -> None:
+    library = subprocess.run(
+        ("faketime", "-f", "+0", "printenv", "LD_PRELOAD"), capture_output=True, text=True, check=True
+    ).stdout.strip()
+    shift = tmp_path / "shift"
+    shift.write_text("+0")
+    faked = {"FAKETIME_TIMESTAMP_FILE": str(shift), "FAKETIME_NO_CACHE": "1", "FAKETIME_DONT_FAKE_MONOTONIC": "1"}
+    chosen = (*LONG, "budget.wall_clock=1h")
+    config = tiny(*chosen)
+    folder = RunFolder.of(config)
+    running = session(config, tiny_overrides, *chosen, LD_PRELOAD=library, **faked)
+    for jump in ("+0", "+1d", "-1d"):
+        aside = tmp_path / "aside"
+        aside.write_text(jump)
+        aside.replace(shift)
+        before = generation(folder)
+        wait_for(lambda before=before: running.poll() is not None or generation(folder) > before + 2)  # type: ignore[misc]
+    running.send_signal(signal.SIGUSR2)
+    _, error = running.communicate()
+    assert running.returncode == 128 + signal.SIGUSR2
+    (line,) = error.strip().splitlines()
+    assert line.startswith(f"atlantis_exp: SIGUSR2: run {folder.name} is committed at step")
+    records = [record for _, record in read(folder.path) if isinstance(record, Metrics)]
+    times = [record.time for record in records]
+    assert times == sorted(times)
+    assert times[-1] - times[0] > 80_000_000  # ms: the jump was seen
+    curves = [record.values for record in records if "throughput/hours" in record.values]
+    hours = [values["throughput/hours"] for values in curves]
+    assert hours == sorted(hours)
+    assert 0 <= hours[0] <= hours[-1] < 1
+    assert all(values["throughput/steps_per_second"] >= 0 for values in curves)
+    commit = folder.commit
+    assert commit is not None
+    assert commit.started <= times[0] <= times[-1] <= commit.updated
 
 
 def test_a_commit_that_the_disk_refuses_is_one_clear_line_and_costs_nothing_committed(

@@ -662,3 +662,22 @@ publish(folder, Store(Path({str(tmp_path)!r}, "store")))
     assert [process.returncode for process in processes] == [0] * 8
     assert rows(tmp_path / "store", "SELECT count(*) FROM metrics") == [(8,)]
     assert rows(tmp_path / "store", "SELECT count(*) FROM experiments WHERE name = 'atlantis'") == [(1,)]
+
+
+def test_a_file_that_is_newer_than_the_commit_waits_for_its_own(tmp_path: Path, root: Path, store: Store) -> None:
+    def film() -> bytes:
+        (place,) = (root / "artifacts").rglob(f"{run_id(tmp_path)}/artifacts/film.mp4")
+        return place.read_bytes()
+
+    journal = Journal(tmp_path)
+    journal.artifact("film.mp4", b"first")
+    journal.flush()
+    publish(tmp_path, store)
+    journal.artifact("film.mp4", b"second")
+    journal.flush()
+    journal.artifact("film.mp4", b"third")  # a kill here leaves it on disk, and no record of it
+    publish(tmp_path, store)
+    assert film() == b"first"
+    journal.flush()
+    publish(tmp_path, store)
+    assert film() == b"third"
