@@ -269,7 +269,7 @@ def build_evaluator(env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig) -> Eva
         num_envs=evaluation.num_envs,
         size=env.size,
         stack=env.stack,
-        video=evaluation.video,
+        video="first_minute" if evaluation.video is True else evaluation.video or None,
     )
 
 
@@ -299,6 +299,7 @@ def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: 
     env = config.env
     plan, learner, memory = build_plan(config), build_learner(config), build_memory(config)
     watched = EpsilonGreedy(learner.evaluated_q_values, len(ACTIONS), watches=True)
+    evaluator = build_evaluator(env, config.evaluation)
     return Trainer(
         plan=plan,
         emulators=build_emulators(env, env.num_envs),
@@ -316,7 +317,8 @@ def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: 
             memory=memory,
             tracker=tracker,
             progress=progress,
-            evaluate=partial(build_evaluator(env, config.evaluation), watched),
+            evaluate=partial(evaluator, watched),
+            film=evaluator.film,
             about=about,
         ),
         checkpoints=Checkpoints(folder / CHECKPOINTS, config.identity()),

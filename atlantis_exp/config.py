@@ -286,7 +286,7 @@ class EvaluationConfig:
     at_end: bool
     num_envs: Annotated[int, Field(ge=1, le=64)]
     seed: Seed
-    video: bool
+    video: Literal["first_minute", "best_minute", "all"] | bool  # of the best episode; true is its first minute
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -411,6 +411,7 @@ class Config:
         for key in ("resume", "device", "threads", "compile", "tracking", "budget", "paths", "samplers", "sampler"):
             del tree[key]
         del tree["env"]["workers"]
+        tree["evaluation"]["video"] = bool(tree["evaluation"]["video"])  # what is filmed of a game is no part of it
         if tree["training"]["ema"] is None:  # a run from before there was the key stays itself
             del tree["training"]["ema"]
         # A list, since the order of phases counts and their names do not.

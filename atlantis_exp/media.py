@@ -80,7 +80,9 @@ def scene(
     import cv2
 
     picture = np.full((420, 560, 3), 24, np.uint8)
-    picture[:, :320] = screen.repeat(2, axis=0).repeat(2, axis=1)
+    # Four bytes a pixel are repeated as one number, ten times as fast as three.
+    pixels = cv2.cvtColor(screen, cv2.COLOR_RGB2RGBA).view(np.uint32)[..., 0].repeat(2, axis=1).repeat(2, axis=0)
+    cv2.cvtColor(pixels.view(np.uint8).reshape(420, 320, 4), cv2.COLOR_RGBA2RGB, dst=picture[:, :320])
 
     def write(text: str, x: int, y: int, colour: tuple[int, int, int] = (255, 255, 255)) -> None:
         cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)
@@ -155,17 +157,22 @@ def strips(groups: Mapping[str, tuple[str, Sequence[float]]], x: str) -> bytes:
 def film(pictures: Iterable[npt.NDArray[np.uint8]], frames_per_second: float) -> bytes:
     """An mp4 (h264, yuv420p) that browsers play, of (height, width, 3) uint8 pictures of even height and width."""
     import av
+    import cv2
 
     # A file, since the second pass, which puts the index first so that a browser starts at once, opens it again.
     with tempfile.NamedTemporaryFile(suffix=".mp4") as file:
         with av.open(file.name, "w", options={"movflags": "faststart"}) as container:
             rate = Fraction(frames_per_second).limit_denominator(1000)
-            stream = container.add_stream("libx264", rate=rate, options={"crf": "28", "preset": "veryfast"})
+            stream = container.add_stream("libx264", rate=rate, options={"crf": "28", "preset": "ultrafast"})
             stream.pix_fmt = "yuv420p"
+            stream.thread_count = 1  # pictures as small as these take a third longer on several
             for picture in pictures:
                 if not stream.codec_context.is_open:
                     stream.height, stream.width = picture.shape[:2]
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+                yuv = cv2.cvtColor(
+                    picture, cv2.COLOR_RGB2YUV_I420
+                )  # a tenth of what the encoder's own conversion takes
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(yuv, format="yuv420p")))
             container.mux(stream.encode())
         return Path(file.name).read_bytes()
 

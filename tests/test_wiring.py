@@ -310,6 +310,7 @@ def test_without_a_terminal_a_line_now_and_then_says_how_far_a_training_is(monke
         tracker=NullJournal(),
         progress=Progress(Console(file=text, width=80, soft_wrap=True)),
         evaluate=unused,
+        film=unused,
     )
     recorder.begin(counters, None)
     recorder._pace = Pace(lambda: now)

@@ -145,7 +145,9 @@ def play(
 def _play(what: str, actor: Actor, env: EnvConfig, evaluation: EvaluationConfig) -> tuple[Evaluation, bytes | None]:
     progress = Progress()
     progress.say(f"{what}: {evaluation.episodes} episodes, epsilon {evaluation.epsilon}")
-    return build_evaluator(env, evaluation)(actor, evaluation.episodes, progress)
+    evaluator = build_evaluator(env, evaluation)
+    played = evaluator(actor, evaluation.episodes, progress)
+    return played, evaluator.film(played, progress)
 
 
 def _record(

@@ -42,7 +42,7 @@ def export(
     settings = replace(evaluation, video=False)
     progress = Progress()
     progress.say(f"{source.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
-    played, _ = build_evaluator(trained.env, settings)(actor, settings.episodes, progress)
+    played = build_evaluator(trained.env, settings)(actor, settings.episodes, progress)
     card = Card(
         format=1,
         run=source.name,

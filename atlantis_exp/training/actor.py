@@ -12,11 +12,11 @@ States = npt.NDArray[np.uint8]  # (B, stack, size, size)
 
 
 class Decisions(NamedTuple):
-    """One action a state, and whether chance chose it (the decision source) rather than the network."""
+    """One action a state, whether chance chose it (the decision source) rather than the network, and what was known."""
 
     actions: npt.NDArray[np.int64]  # (B,)
     random: npt.NDArray[np.bool_]  # (B,)
-    agrees: npt.NDArray[np.bool_] | None = None  # (B,), with the network's best action, where it was asked for all
+    values: npt.NDArray[np.float32] | None = None  # (B, actions), the network's, where it was asked for all
 
 
 class Actor(Protocol):
@@ -29,7 +29,7 @@ class Actor(Protocol):
 class EpsilonGreedy:
     """The network's best action, or with probability epsilon any action (report figure 3.2).
 
-    The network is asked only where chance does not choose, unless `watches`: then the decisions say where both agree.
+    The network is asked only where chance does not choose, unless `watches`: then the decisions hold its values.
     """
 
     q_values: Callable[[States], npt.NDArray[np.float32]]
@@ -42,9 +42,9 @@ class EpsilonGreedy:
         for row in np.flatnonzero(random).tolist():
             actions[row] = generators[row].integers(self.num_actions)
         if self.watches:
-            best = self.q_values(states).argmax(axis=1)
-            actions[~random] = best[~random]
-            return Decisions(actions, random, actions == best)
+            values = self.q_values(states)
+            actions[~random] = values.argmax(axis=1)[~random]
+            return Decisions(actions, random, values)
         if not random.all():
             actions[~random] = self.q_values(states[~random]).argmax(axis=1)
         return Decisions(actions, random)

@@ -1,5 +1,6 @@
 """Evaluation: episodes at a fixed epsilon, on their own emulators and random streams (report figure 3.3)."""
 
+from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -32,13 +33,20 @@ class Episode:
     truncated: bool = False
     actions: bytearray = field(default_factory=bytearray)  # one a step
     random: bytearray = field(default_factory=bytearray)  # 1 where chance chose
-    agrees: bytearray = field(default_factory=bytearray)  # 1 where that was the network's best action, if it was asked
+    rewards: "array[float]" = field(default_factory=lambda: array("f"))  # one a step
+    raw_values: bytearray = field(default_factory=bytearray)  # of `values`
     points: list[float] = field(default_factory=lambda: [0.0] * len(SOURCES))  # the score in the order of SOURCES
 
     @property
     def steps(self) -> int:
         """Decisions in the episode."""
         return len(self.actions)
+
+    @property
+    def values(self) -> npt.NDArray[np.float32] | None:
+        """What the network thought of each action before every step, (steps, actions); None if it was not asked."""
+        values = np.frombuffer(self.raw_values, np.float32).reshape(-1, len(ACTIONS))
+        return values if values.size else None
 
     @property
     def random_share(self) -> float:
@@ -84,7 +92,12 @@ class Evaluation:
     @property
     def chance_agreement(self) -> float | None:
         """Share of the random decisions that equal the network's best action; None where that is not known."""
-        agrees = [a for episode in self.episodes for a, r in zip(episode.agrees, episode.random, strict=False) if r]
+        agrees: list[bool] = []
+        for episode in self.episodes:
+            if (values := episode.values) is not None:
+                by_chance = np.flatnonzero(np.frombuffer(episode.random, np.uint8))
+                actions = np.frombuffer(episode.actions, np.uint8)[by_chance]
+                agrees += (values[by_chance].argmax(axis=1) == actions).tolist()
         return sum(agrees) / len(agrees) if agrees else None
 
     @property
@@ -213,9 +226,10 @@ def evaluate(
             episode = played[playing[env]]
             episode.actions.append(int(decisions.actions[row]))
             episode.random.append(bool(decisions.random[row]))
-            if decisions.agrees is not None:
-                episode.agrees.append(bool(decisions.agrees[row]))
+            if decisions.values is not None:
+                episode.raw_values += decisions.values[row].astype(np.float32).tobytes()
             reward = float(steps.rewards[row])
+            episode.rewards.append(reward)
             episode.score += reward
             if reward:
                 episode.points = [

@@ -7,7 +7,7 @@ from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.vector import Emulators
 from atlantis_exp.training.actor import Actor
 from atlantis_exp.training.evaluation import Evaluation, evaluate
-from atlantis_exp.training.film import film_episode
+from atlantis_exp.training.film import Part, film_episode
 from atlantis_exp.training.progress import Progress
 
 
@@ -22,7 +22,7 @@ class Evaluator:
     num_envs: int  # episodes played side by side
     size: int  # pixels
     stack: int  # observations
-    video: bool  # of the best episode
+    video: Part | None  # what is filmed of the best episode
 
     def __call__(
         self,
@@ -31,8 +31,8 @@ class Evaluator:
         progress: Progress,
         stop: Callable[[], bool] = lambda: False,
         emulators: Emulators | None = None,
-    ) -> tuple[Evaluation, bytes | None]:
-        """Play so many episodes; with the film of the best one where there is to be one.
+    ) -> Evaluation:
+        """Play so many episodes.
 
         emulators: those to play on; None: new ones.
 
@@ -40,7 +40,7 @@ class Evaluator:
             Stopped: when `stop` says so.
         """
         with emulators or self.make_emulators(min(self.num_envs, episodes)) as emulators:
-            result = evaluate(
+            return evaluate(
                 actor,
                 emulators,
                 episodes=episodes,
@@ -51,6 +51,9 @@ class Evaluator:
                 on_step=progress.evaluating,
                 stop=stop,
             )
-        if not self.video:
-            return result, None
-        return result, film_episode(result.best, actor, self.make_emulator(), self.stack)
+
+    def film(self, evaluation: Evaluation, progress: Progress) -> bytes | None:
+        """An mp4 of the best episode; None where there is to be none."""
+        if self.video is None:
+            return None
+        return film_episode(evaluation.best, self.make_emulator(), self.video, progress.filming)

@@ -1,7 +1,8 @@
 """Film: an episode played again from its seed and actions, with who decided what next to the screen."""
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from itertools import islice
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -9,10 +10,13 @@ import numpy.typing as npt
 from atlantis_exp.game.emulator import ACTIONS, Emulator
 from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.media import film, scene
-from atlantis_exp.training.actor import Actor, EpsilonGreedy, States
+from atlantis_exp.training.actor import States
 from atlantis_exp.training.evaluation import Episode
 
+Part = Literal["first_minute", "best_minute", "all"]
 QValues = Callable[[States], npt.NDArray[np.float32]]
+
+FRAMES_A_MINUTE = 3_600  # of the game
 
 
 class Moment(NamedTuple):
@@ -26,17 +30,16 @@ class Moment(NamedTuple):
     q_values: npt.NDArray[np.float32] | None  # (actions,), what the network thought of them even where chance chose
 
 
-def moments(episode: Episode, emulator: Emulator, stack: int, q_values: QValues | None = None) -> Iterator[Moment]:
-    """Play an episode again from its seed and actions; stack in observations, as the network wants its states."""
-    observation = emulator.reset(episode.seed)
-    stacks = FrameStack(1, observation.shape[0], stack)
-    stacks.reset([0], observation[np.newaxis])
+def moments(episode: Episode, emulator: Emulator, start: int = 0) -> Iterator[Moment]:
+    """Play an episode again from its seed and actions; moments begin before the step `start`."""
+    emulator.reset(episode.seed)
+    values = episode.values
     score, frame = 0.0, 0
-    for action, random in zip(episode.actions, episode.random, strict=True):
-        values = None if q_values is None else q_values(stacks.state)[0]
-        yield Moment(emulator.screen_rgb(), score, frame, action, bool(random), values)
+    for index, (action, random) in enumerate(zip(episode.actions, episode.random, strict=True)):
+        if index >= start:
+            q_values = None if values is None else values[index]
+            yield Moment(emulator.screen_rgb(), score, frame, action, bool(random), q_values)
         step = emulator.step(action)
-        stacks.push(step.observation[np.newaxis])
         score += step.reward
         frame += step.frames
     yield Moment(emulator.screen_rgb(), score, frame, None, False, None)
@@ -60,14 +63,35 @@ def greedy_moments(seed: int, emulator: Emulator, stack: int, q_values: QValues)
     yield Moment(emulator.screen_rgb(), score, frame, None, False, None)
 
 
-def film_episode(episode: Episode, actor: Actor, emulator: Emulator, stack: int) -> bytes:
-    """An mp4 of an episode at the game's own speed of 60 frames a second, on average, with who decided what."""
-    chooser = "network" if isinstance(actor, EpsilonGreedy) else "constant player"
-    q_values = actor.q_values if isinstance(actor, EpsilonGreedy) else None
+def span(episode: Episode, part: Part) -> tuple[int, int]:
+    """The first step of a part of an episode, and the step after its last; a minute is one of the game, on average."""
+    minute = round(FRAMES_A_MINUTE * episode.steps / episode.frames)
+    if part == "all" or minute >= episode.steps:
+        return 0, episode.steps
+    if part == "first_minute":
+        return 0, minute
+    earned = np.concatenate([[0.0], np.cumsum(episode.rewards)])  # before each step
+    start = int(np.argmax(earned[minute:] - earned[:-minute]))
+    return start, start + minute
+
+
+def film_episode(
+    episode: Episode, emulator: Emulator, part: Part, tell: Callable[[int, int], None] = lambda *_: None
+) -> bytes:
+    """An mp4 of a part of an episode at the game's own speed of 60 frames a second, on average, with who decided what.
+
+    tell is called with how many of how many pictures are drawn.
+    """
+    chooser = "player" if episode.values is None else "network"
+    start, end = span(episode, part)
 
     def pictures() -> Iterator[npt.NDArray[np.uint8]]:
-        for step, moment in enumerate(moments(episode, emulator, stack, q_values)):
-            lines = (f"step {step:,} of {episode.steps:,}", f"score {moment.score:,.0f} of {episode.score:,.0f}")
+        for index, moment in enumerate(islice(moments(episode, emulator, start), end - start + 1)):
+            tell(index, end - start)
+            lines = (
+                f"step {start + index:,} of {episode.steps:,}",
+                f"score {moment.score:,.0f} of {episode.score:,.0f}",
+            )
             source = "random" if moment.random else chooser
             yield scene(moment.screen, lines, source, ACTIONS, moment.action, moment.q_values)
 

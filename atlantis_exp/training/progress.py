@@ -117,6 +117,12 @@ class Progress:
                 f"  evaluation: {over} of {len(episodes)} episodes over, {steps:,} steps, highest score {high:,.0f}"
             )
 
+    def filming(self, drawn: int, pictures: int) -> None:
+        """To be called with every picture of a film: writes a line now and then."""
+        if self._is_time_for_a_line():
+            self._shown = time.monotonic()
+            self.say(f"  film: {drawn:,} of {pictures:,} steps")
+
     def evaluated(self, step: int, frames: int, evaluation: "Evaluation") -> None:
         """To be called after every evaluation of a training, with the steps and frames that it has trained for."""
         summary = evaluation.summary

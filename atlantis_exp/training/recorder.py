@@ -23,8 +23,10 @@ from atlantis_exp.training.plan import Cadence, Counters, Plan
 from atlantis_exp.training.progress import Pace, Progress, Snapshot
 
 Stop = Callable[[], bool]
-Evaluate = Callable[[int, Progress, Stop], tuple[Evaluation, bytes | None]]
-"""Plays so many episodes; with a film of the best one, if there is to be one. Raises: Stopped."""
+Evaluate = Callable[[int, Progress, Stop], Evaluation]
+"""Plays so many episodes. Raises: Stopped."""
+Film = Callable[[Evaluation, Progress], bytes | None]
+"""An mp4 of an evaluation's best episode, if there is to be one."""
 
 
 class Played(NamedTuple):
@@ -58,10 +60,11 @@ class Recorder:
         tracker: Tracker,
         progress: Progress,
         evaluate: Evaluate,
+        film: Film,
         about: str = "",
     ) -> None:
         self.plan, self.cadence, self.learner, self.memory = plan, cadence, learner, memory
-        self.tracker, self.progress, self._evaluate = tracker, progress, evaluate
+        self.tracker, self.progress, self._evaluate, self._film = tracker, progress, evaluate, film
         self.about = about
         self.episodes: list[Played] = []
         self.best_mean = -np.inf  # of all evaluations
@@ -161,7 +164,9 @@ class Recorder:
         try:
             episodes = self.cadence.final_episodes if has_ended else self.cadence.interim_episodes
             with self._pace.paused():
-                evaluation, video = self._evaluate(episodes, self.progress, stop)
+                evaluation = self._evaluate(episodes, self.progress, stop)
+                is_best = evaluation.summary.mean > self.best_mean
+                video = self._film(evaluation, self.progress) if is_best else None
         except Stopped:
             return
         self.evaluation_pending = False
@@ -179,7 +184,6 @@ class Recorder:
             {name: tensor.contiguous() for name, tensor in self.learner.evaluated.state_dict().items()}
         )
         results = {name: value for name, value in metrics.items() if name.startswith("evaluation/")}
-        is_best = evaluation.summary.mean > self.best_mean
         self.tracker.model(NETWORK, weights, step, results, best=is_best)
         if is_best:
             self.best_mean, self.best_step = evaluation.summary.mean, step

@@ -149,7 +149,7 @@ def small() -> Callable[..., Trainer]:
             num_envs=1,
             size=SIZE,
             stack=STACK,
-            video=False,
+            video=None,
         )
         trainer = Trainer(
             plan=plan,
@@ -169,6 +169,7 @@ def small() -> Callable[..., Trainer]:
                 tracker=Journal(folder),
                 progress=Progress(console or Console(quiet=True)),
                 evaluate=partial(evaluator, EpsilonGreedy(learner.evaluated_q_values, len(ACTIONS), watches=True)),
+                film=evaluator.film,
             ),
             checkpoints=Checkpoints(folder / "checkpoints", "small"),
             max_steps=max_steps,

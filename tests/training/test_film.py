@@ -1,15 +1,20 @@
 """Episodes played again from their seeds and actions."""
 
+import io
+from array import array
 from collections.abc import Callable
+from typing import get_args
 
+import av
 import numpy as np
 import pytest
 
 from atlantis_exp.build import build_emulators, build_learner, make_emulator
 from atlantis_exp.config import Config
+from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.training.actor import Actor, EpsilonGreedy, RandomActor
 from atlantis_exp.training.evaluation import Episode, evaluate
-from atlantis_exp.training.film import moments
+from atlantis_exp.training.film import Part, film_episode, moments, span
 
 Compose = Callable[..., Config]
 
@@ -28,11 +33,15 @@ def played(tiny: Compose) -> Callable[..., Episode]:
 def test_an_episode_can_be_seen_again_from_its_seed_and_actions(tiny: Compose, played: Callable[..., Episode]) -> None:
     episode = played()
     emulator = make_emulator(tiny("env.max_steps=25").env)()
-    seen = list(moments(episode, emulator, stack=4))
+    seen = list(moments(episode, emulator))
     assert len(seen) == episode.steps + 1
     assert seen[0].screen.shape == (210, 160, 3)
     assert [moment.action for moment in seen] == [*episode.actions, None]
     assert [moment.random for moment in seen[:-1]] == [bool(chance) for chance in episode.random]
+    later = list(moments(episode, emulator, start=20))
+    for moment, same in zip(later, seen[20:], strict=True):
+        assert np.array_equal(moment.screen, same.screen)
+        assert moment[1:5] == same[1:5]
     emulator.reset(episode.seed)
     steps = [emulator.step(action) for action in episode.actions]
     assert sum(step.reward for step in steps) == episode.score == seen[-1].score
@@ -40,14 +49,45 @@ def test_an_episode_can_be_seen_again_from_its_seed_and_actions(tiny: Compose, p
     assert np.array_equal(seen[-1].screen, emulator.screen_rgb())
 
 
-def test_the_values_beside_a_film_are_those_that_the_network_decided_by(
+def test_the_values_in_a_film_are_those_that_the_network_decided_by(
     tiny: Compose, played: Callable[..., Episode]
 ) -> None:
     learner = build_learner(tiny())
-    episode = played(EpsilonGreedy(learner.q_values, 4))
+    episode = played(EpsilonGreedy(learner.q_values, 4, watches=True))
     emulator = make_emulator(tiny("env.max_steps=25").env)()
-    asked = [moment for moment in moments(episode, emulator, 4, learner.q_values) if moment.action is not None]
-    decided = [moment for moment in asked if not moment.random]
-    assert 0 < len(decided) < len(asked)
-    assert all(moment.q_values is not None for moment in asked)
+    filmed = [moment for moment in moments(episode, emulator) if moment.action is not None]
+    decided = [moment for moment in filmed if not moment.random]
+    assert 0 < len(decided) < len(filmed)
+    assert all(moment.q_values is not None for moment in filmed)
     assert [moment.action for moment in decided] == [int(moment.q_values.argmax()) for moment in decided]  # type: ignore[union-attr]
+    observations = FrameStack(1, 40, 4)
+    observations.reset([0], emulator.reset(episode.seed)[np.newaxis])
+    for moment in filmed:
+        np.testing.assert_array_equal(learner.q_values(observations.state)[0], moment.q_values)
+        assert moment.action is not None
+        observations.push(emulator.step(moment.action).observation[np.newaxis])
+
+
+def test_a_part_of_an_episode_is_a_minute_of_the_game_or_all_of_it() -> None:
+    steps = 3_000
+    episode = Episode(1, frames=4 * steps, actions=bytearray(steps), rewards=array("f", [0.0] * steps))
+    assert span(episode, "all") == (0, steps)
+    assert span(episode, "first_minute") == (0, 900)
+    assert span(episode, "best_minute") == (0, 900)  # without points
+    for step, points in ((150, 900.0), (1_400, 500.0), (2_299, 500.0), (2_300, 200.0)):
+        episode.rewards[step] = points
+    assert span(episode, "best_minute") == (1_400, 2_300)
+    short = Episode(1, frames=400, actions=bytearray(100), rewards=array("f", [0.0] * 100))
+    assert {span(short, part) for part in get_args(Part)} == {(0, 100)}
+
+
+def test_a_film_of_a_part_shows_that_part_and_says_how_far_it_is(tiny: Compose, played: Callable[..., Episode]) -> None:
+    episode = played()
+    episode.frames = 12 * 3_600 * episode.steps // 60  # so slow a game that a minute has five steps
+    told: list[tuple[int, int]] = []
+    content = film_episode(
+        episode, make_emulator(tiny("env.max_steps=25").env)(), "first_minute", lambda *n: told.append(n)
+    )
+    assert told == [(index, 5) for index in range(6)]
+    with av.open(io.BytesIO(content), "r") as container:
+        assert len(list(container.decode(video=0))) == 6
