@@ -169,9 +169,8 @@ def film(pictures: Iterable[npt.NDArray[np.uint8]], frames_per_second: float) ->
             for picture in pictures:
                 if not stream.codec_context.is_open:
                     stream.height, stream.width = picture.shape[:2]
-                yuv = cv2.cvtColor(
-                    picture, cv2.COLOR_RGB2YUV_I420
-                )  # a tenth of what the encoder's own conversion takes
+                # A tenth of what the encoder's own conversion takes.
+                yuv = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2YUV_I420), np.uint8)
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(yuv, format="yuv420p")))
             container.mux(stream.encode())
         return Path(file.name).read_bytes()

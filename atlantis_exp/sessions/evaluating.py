@@ -120,10 +120,9 @@ def play(
     low, high = (env.frameskip, env.frameskip + 1) if isinstance(env.frameskip, int) else env.frameskip
     window = Window(60 / ((low + high - 1) / 2), scale)  # steps a second, on average
     actor, emulators = build_person(env, window.choose)
+    evaluator, progress = build_evaluator(env, evaluation), Progress()
     try:
-        played = build_evaluator(env, evaluation)(
-            actor, evaluation.episodes, Progress(), lambda: window.closed, emulators
-        )
+        played = evaluator(actor, evaluation.episodes, progress, lambda: window.closed, emulators)
     except Stopped:
         raise Fault("the window was closed before the last episode ended; nothing is recorded") from None
     finally:
@@ -139,7 +138,7 @@ def play(
         "paths": to_dict(paths),
     }
     shown = labels(folder.name, run_colour("human"), "human")
-    _record(folder, facts, played, tracking, outputs, shown, command)
+    _record(folder, facts, (played, evaluator.film(played, progress)), tracking, outputs, shown, command)
 
 
 def _play(what: str, actor: Actor, env: EnvConfig, evaluation: EvaluationConfig) -> tuple[Evaluation, bytes | None]:

@@ -56,7 +56,7 @@ def deciding(tiny_overrides: tuple[str, ...], tmp_path: Path) -> Callable[..., s
     """Starts a decision as a shell does."""
 
     def start(*words: str, env: dict[str, str] | None = None) -> subprocess.Popen[str]:
-        overrides = replaced(tiny_overrides, *SHORT, f"paths.outputs={tmp_path / 'o'}", *words)
+        overrides = replaced(replaced(tiny_overrides, *SHORT), f"paths.outputs={tmp_path / 'o'}", *words)
         return subprocess.Popen(
             (sys.executable, "-m", "atlantis_exp", "decide", *overrides),
             cwd=REPOSITORY,

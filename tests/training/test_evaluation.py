@@ -84,11 +84,15 @@ def test_the_actions_are_counted_by_who_chose_them() -> None:
 
 
 def test_what_the_policy_does_is_counted() -> None:
+    def episode(actions: list[int], random: list[int], best: list[int]) -> Episode:
+        values = bytearray(np.eye(4, dtype=np.float32)[best].tobytes())
+        return Episode(1, 0.0, 12, False, bytearray(actions), bytearray(random), raw_values=values)
+
     evaluation = Evaluation(
         0.5,
         [
-            Episode(1, 0.0, 12, False, bytearray([0, 1, 1, 3]), bytearray([1, 0, 0, 1]), bytearray([1, 1, 1, 0])),
-            Episode(2, 0.0, 12, False, bytearray([0, 1, 2, 1]), bytearray([1, 0, 1, 0]), bytearray([0, 1, 0, 1])),
+            episode([0, 1, 1, 3], [1, 0, 0, 1], best=[0, 1, 1, 0]),
+            episode([0, 1, 2, 1], [1, 0, 1, 0], best=[1, 1, 0, 1]),
         ],
     )
     assert evaluation.chance_agreement == 1 / 4
