@@ -106,6 +106,7 @@ def another(key: str, value: Any) -> Any:
         "optimizer.name": ("adam", "adamw"),
         "training.precision": ("fp32", "bf16"),
         "training.ema": (100, 200),
+        "evaluation.video": (False,) if value else ("first_minute",),
         "env.max_pool": (False,) if value else (True,),
         "env.crop": ([0, 160, 210, 0], [16, 160, 96, 0]),
         "env.frameskip": (4, 3),
