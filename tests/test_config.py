@@ -67,6 +67,7 @@ LAST_RUNGS = {  # from the report's head and objective to those of experiment=fa
 
 
 @pytest.mark.parametrize(("first", "rungs"), [("ablation_00_report", RUNGS), ("ablation_06_clip", LAST_RUNGS)])
+@pytest.mark.slow
 def test_each_rung_of_the_ablation_changes_what_it_says_and_nothing_else(
     first: str, rungs: dict[str, set[str]]
 ) -> None:

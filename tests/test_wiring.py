@@ -221,10 +221,10 @@ def test_every_preset_trains(preset: str, started: Started, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("memory", "disk", "shortage"),
     [
-        pytest.param(
-            *(2**20, 2**40),
+        (
+            2**20,
+            2**40,
             r"memory will not suffice: \d+ MiB needed, 1 MiB available; lower replay.max_bytes or replay.",
-            marks=pytest.mark.slow,
         ),
         (
             2**40,
@@ -233,6 +233,7 @@ def test_every_preset_trains(preset: str, started: Started, tmp_path: Path) -> N
         ),
     ],
 )
+@pytest.mark.slow
 def test_a_training_that_will_not_fit_is_refused_before_it_begins_unless_a_warning_is_enough(
     memory: int,
     disk: int,

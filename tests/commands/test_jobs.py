@@ -84,16 +84,12 @@ def test_more_than_four_values_become_a_few_digits_that_tell_runs_apart() -> Non
     "line",
     [
         "optimizer.lr=0.0001,0.001 phase=single,two_phase objective.n_step=1,3",
-        *(
-            pytest.param(line, marks=pytest.mark.slow)
-            for line in (
-                "seed=0,1 model=cnn,resnet experiment=none,quick",
-                f"{MANY} evaluation.episodes=7,8 sampler=uniform,top_half",
-                "seed=0,1 threads=1,2 env.workers=2,3",
-            )
-        ),
+        "seed=0,1 model=cnn,resnet experiment=none,quick",
+        f"{MANY} evaluation.episodes=7,8 sampler=uniform,top_half",
+        "seed=0,1 threads=1,2 env.workers=2,3",
     ],
 )
+@pytest.mark.slow
 def test_titles_of_a_sweep_differ_exactly_where_what_is_trained_does(line: str) -> None:
     asked = jobs(f"-m {line}")
     assert len({job.config.identity() for job in asked}) > 1

@@ -146,6 +146,7 @@ def test_the_same_comparison_draws_the_same_figures(comparison: Comparison) -> N
     assert content(draw(comparison)) == content(draw(comparison))
 
 
+@pytest.mark.slow
 def test_a_comparison_without_curves_has_the_other_figures(recorded: Recorded, tmp_path: Path) -> None:
     recorded(curve=())
     gathered = gather(tmp_path)

@@ -117,6 +117,7 @@ def test_the_score_is_survival_times_rate_and_the_rate_is_the_sum_of_what_paid(
     assert survival < 0 < rate
 
 
+@pytest.mark.slow
 def test_a_split_that_one_episode_lacks_is_not_known_of_its_group_and_shown_as_empty(
     recorded: Recorded, tmp_path: Path
 ) -> None:

@@ -370,6 +370,7 @@ def test_the_seeds_that_the_next_look_wants_are_named_group_by_group() -> None:
 
 
 @pytest.mark.parametrize("shape", ["normal", "bimodal"])
+@pytest.mark.thinned(2)
 def test_whoever_follows_what_is_said_to_the_end_is_seldom_told_a_difference_that_is_none(shape: str) -> None:
     rng, question, comparisons = np.random.default_rng(0), Question(("model", "sampler")), 400
     labels = list(product(("cnn", "resnet"), ("uniform", "top_half")))
@@ -467,6 +468,7 @@ def test_who_leads_while_training_is_said_as_a_description() -> None:
 
 
 @pytest.mark.usefixtures("_undrawn")
+@pytest.mark.slow
 def test_the_same_question_of_more_seeds_is_the_same_comparison_and_remembers_its_looks(
     record_seeds: Callable[..., list[Path]], run: Run, tmp_path: Path
 ) -> None:

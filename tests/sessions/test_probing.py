@@ -30,6 +30,8 @@ from atlantis_exp.sessions.probing import Network, asked, median_run, part, prob
 from atlantis_exp.sessions.training import train
 from atlantis_exp.training.actor import EpsilonGreedy
 
+pytestmark = pytest.mark.slow
+
 Compose = Callable[..., Config]
 PRETRAINED = Path(__file__).resolve().parents[2] / "pretrained"
 
@@ -120,7 +122,6 @@ def frames_of(film: bytes) -> int:
     return len(pictures)
 
 
-@pytest.mark.slow
 def test_a_network_agrees_with_itself_and_never_parts(trained: list[Training], folder: Path) -> None:
     run = trained[0]
     result = probe_groups(folder, {"a": [run], "b": [run]}, None)
@@ -135,7 +136,6 @@ def test_a_network_agrees_with_itself_and_never_parts(trained: list[Training], f
     assert result.facts == {"networks asked about": f"128 archived states, SHA-256 {read_archive().sha256}"}
 
 
-@pytest.mark.slow
 def test_the_same_runs_give_the_same_tables_words_and_films(trained: list[Training], folder: Path) -> None:
     groups = {"../../a": [trained[0]], "<b>": [trained[1]]}
     first = probe_groups(folder, groups, None)
@@ -158,7 +158,6 @@ def test_the_search_for_a_parting_ends(trained: list[Training], folder: Path, mo
 
 
 @pytest.mark.parametrize("which", ["unlike", "nearly_alike"])
-@pytest.mark.thinned(2)
 def test_networks_part_where_a_naive_loop_finds_it(
     which: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -176,7 +175,6 @@ def test_networks_part_where_a_naive_loop_finds_it(
     assert frames_of(film) == 2 * 20  # three frames a step
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("early", [0, 1])
 def test_the_last_picture_of_the_game_that_ends_first_stays(
     nearly_alike: tuple[Network, Network], early: int, monkeypatch: pytest.MonkeyPatch
@@ -227,7 +225,6 @@ def test_the_run_of_the_median_score_speaks_for_a_group(recorded: Callable[..., 
     assert median_run([run for run in runs if run.config["seed"] != 2]).config["seed"] == 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("baseline", "first"), [(None, "a x"), ("d", "d x")])
 def test_of_many_groups_each_is_compared_with_one(
     trained: list[Training], folder: Path, monkeypatch: pytest.MonkeyPatch, baseline: str | None, first: str
@@ -243,7 +240,6 @@ def test_of_many_groups_each_is_compared_with_one(
     assert f"Of 5 groups, networks are compared with that of {first} only." in result.notes
 
 
-@pytest.mark.slow
 def test_compare_asks_why_and_keeps_page_tables_and_films(
     trained: list[Training],
     folder: Path,
@@ -275,7 +271,6 @@ def test_compare_asks_why_and_keeps_page_tables_and_films(
     assert frames_of((page.parent / sources[0]).read_bytes()) > 1
 
 
-@pytest.mark.slow
 def test_compare_alone_loads_no_torch(recorded: Callable[..., Path], tmp_path: Path) -> None:
     recorded()
     code = (

@@ -221,6 +221,7 @@ def test_a_search_without_a_trial_that_was_trained_to_its_end_says_so(searching:
         session_of(searching).print_results()
 
 
+@pytest.mark.slow
 def test_a_run_that_went_on_beyond_the_budget_is_no_result_of_a_search_within_it(searching: Searching) -> None:
     session = session_of(searching, "budget.steps=40", space=("optimizer=choice(adam)",))
     with session.claimed() as trial:

@@ -379,7 +379,7 @@ def test_a_journal_that_was_cut_is_one_clear_line(tiny: Compose) -> None:
         train(Job(tiny("evaluation.at_end=false", "evaluation.every_steps=null")))
 
 
-@pytest.mark.thinned(4)
+@pytest.mark.slow
 @pytest.mark.parametrize("sampler", ["prioritized", "uniform"])
 @pytest.mark.parametrize("damaged", ["newest", "oldest"])
 def test_a_damaged_part_of_the_replay_memory_costs_that_part_and_is_said(

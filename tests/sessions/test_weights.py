@@ -53,6 +53,7 @@ def test_best_is_what_the_last_commit_says(interrupted: RunFolder) -> None:
     assert weights != (files / "160.safetensors").read_bytes()
 
 
+@pytest.mark.slow
 def test_best_of_the_commit_before_is_found_where_the_last_is_damaged(interrupted: RunFolder) -> None:
     newest = max(interrupted.checkpoints.glob("[0-9]*"))
     (newest / "state.json").write_bytes(b"{}")
@@ -75,6 +76,7 @@ def test_a_flipped_byte_is_one_line(
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 def test_the_run_goes_on_with_the_best_of_its_last_commit(tiny: Compose, interrupted: RunFolder) -> None:
     train(Job(tiny("tracking.commit_episodes=1", "phase.quick.steps=160")))
     weights, step = stored_weights(interrupted, "best")

@@ -64,11 +64,12 @@ def test_a_training_with_a_forecast_is_bit_for_bit_the_one_without(
     "overrides",
     [
         ("model=cnn",),
-        pytest.param(("model=resnet", "env.size=16", "training.ema=10"), marks=pytest.mark.slow),
-        pytest.param(("env.num_envs=3", "env.workers=2", "sampler=prioritized"), marks=pytest.mark.slow),
-        pytest.param(("model=resnet_fast", "objective=quantile", "env.noop_max=5"), marks=pytest.mark.slow),
+        ("model=resnet", "env.size=16", "training.ema=10"),
+        ("env.num_envs=3", "env.workers=2", "sampler=prioritized"),
+        ("model=resnet_fast", "objective=quantile", "env.noop_max=5"),
     ],
 )
+@pytest.mark.slow
 def test_a_real_training_is_none_the_wiser_of_forecasts_at_its_start_and_when_it_goes_on(
     tiny: Callable[..., Config],
     started: Callable[[Config, Path], Trainer],
