@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -17,28 +17,16 @@ from torch import nn
 
 from atlantis_exp import config as cfg
 from atlantis_exp.checking import to_dict
+from atlantis_exp.components import admitted, describe
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.game.emulator import ACTIONS, Emulator
 from atlantis_exp.game.preprocessing import FrameStack, Preprocessing
 from atlantis_exp.game.vector import Emulators, make_emulators
 from atlantis_exp.learning.allocation import keep_freed_memory
-from atlantis_exp.learning.learner import Learner, splits
-from atlantis_exp.learning.objectives import DQN, DoubleDQN, DoubleQuantile, Objective, Quantile
-from atlantis_exp.learning.schedules import (
-    Constant,
-    Exponential,
-    Linear,
-    LinearSteps,
-    OneCycle,
-    Schedule,
-)
-from atlantis_exp.networks.cnn import DQNCnn
+from atlantis_exp.learning.learner import Learner
 from atlantis_exp.networks.dropout import seed_dropout
 from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
-from atlantis_exp.networks.resnet import ResNetDQN
-from atlantis_exp.networks.resnet_fast import ResNetFast
 from atlantis_exp.replay.memory import ReplayMemory, Returns
-from atlantis_exp.replay.samplers import PrioritizedSampler, Sampler, TopHalfSampler, UniformSampler
 from atlantis_exp.runs.folder import CHECKPOINTS
 from atlantis_exp.runs.journal import Tracker
 from atlantis_exp.training.actor import Actor, ConstantActor, EpsilonGreedy, PersonActor, RandomActor
@@ -51,30 +39,6 @@ from atlantis_exp.training.trainer import Trainer
 
 _THREADS = torch.get_num_threads()  # torch's own choice, before anything here changes it
 
-# The registry: a schema class of `config` to the class that it configures.
-NETWORKS: dict[type, type[nn.Module]] = {
-    cfg.CnnConfig: DQNCnn,
-    cfg.ResNetConfig: ResNetDQN,
-    cfg.ResNetFastConfig: ResNetFast,
-}
-OBJECTIVES: dict[str, type[Objective]] = {
-    "dqn": DQN,
-    "double_dqn": DoubleDQN,
-    "quantile": Quantile,
-    "double_quantile": DoubleQuantile,
-}
-SAMPLERS: dict[type, type[Sampler]] = {
-    cfg.UniformConfig: UniformSampler,
-    cfg.TopHalfConfig: TopHalfSampler,
-    cfg.PrioritizedConfig: PrioritizedSampler,
-}
-SCHEDULES: dict[type, type[Schedule]] = {
-    cfg.ExponentialConfig: Exponential,
-    cfg.LinearConfig: Linear,
-    cfg.LinearStepsConfig: LinearSteps,
-    cfg.ConstantConfig: Constant,
-    cfg.OneCycleConfig: OneCycle,
-}
 OPTIMIZERS: dict[str, type[torch.optim.Optimizer]] = {
     "adamw": torch.optim.AdamW,
     "adam": torch.optim.Adam,
@@ -136,12 +100,72 @@ def choose_precision(name: str, device: torch.device) -> str:
     return "bf16" if torch.cpu._is_avx512_bf16_supported() else "fp32"
 
 
+def build_component(config: cfg.Config, part: cfg.ComponentConfig, *given: object) -> Any:
+    """A part of a config as what its name stands for.
+
+    given: what its constructor takes besides settings.
+
+    Raises:
+        ConfigError: where it is a plugin's that no command line has named, or whose code fails.
+    """
+    if (component := part.component) is None:
+        raise ConfigError(needs(config))
+    made = component.load()
+    with component.blamed():
+        return made(*given, **part.settings)
+
+
+def described(config: cfg.Config) -> str:
+    """What people call the plugins of a config: `mynet 0.3, sha 1a2b3c4d5e6f`."""
+    return "; ".join(describe(name, each.version, each.sha256) for name, each in config.plugins.items())
+
+
+def import_components(config: cfg.Config) -> None:
+    """Import the classes that a config names.
+
+    Raises:
+        ConfigError: where one is a plugin's that no command line has named, or cannot be imported.
+    """
+    parts: list[cfg.ComponentConfig] = [config.model, config.objective, config.epsilon, config.lr_schedule]
+    for part in (*parts, *(config.sampler_of(phase) for phase in config.phase)):
+        if part.component is None:
+            raise ConfigError(needs(config))
+        part.component.load()
+
+
+def _check_output(config: cfg.Config, network: nn.Module) -> None:
+    """Raise ConfigError where a plugin's network does not take states, or return what its head does."""
+    component, env = config.model.component, config.env
+    if component is None or component.plugin is None:
+        return
+    shape: tuple[int, ...] = (2, len(ACTIONS))
+    if config.model.head == "quantile":
+        shape = (*shape, config.objective.settings["quantiles"])
+    with component.blamed(), torch.no_grad():
+        made = tuple(network.eval()(torch.zeros(2, env.stack, env.size, env.size)).shape)
+        if made != shape:
+            raise TypeError(f"{component.class_name} returns {made} for two states; it should be {shape}, the head's")
+
+
+def needs(config: cfg.Config) -> str:
+    """The line that says which plugins a config needs, and what is wrong with those that there are."""
+    there = {each.plugin.name: each.plugin for each in admitted().values() if each.plugin}
+    wanted = {name: describe(name, each.version, each.sha256) for name, each in config.plugins.items()}
+    lacking = {name: text for name, text in wanted.items() if str(there.get(name)) != text}
+    given = [f"; {there[name].shown} is {there[name]}, which makes another run" for name in lacking if name in there]
+    names = [name if config.plugins[name].version else f"./{name}.py" for name in lacking]
+    return f"needs plugins={','.join(names)} ({'; '.join(lacking.values())}){''.join(given)}"
+
+
 def build_network(config: cfg.Config, name: str) -> nn.Module:
     """A network with weights from the named stream; the global generator is as it was."""
+    if config.model.component is not None:
+        config.model.component.load()  # what a module draws when it is imported is no part of the weights
     initial, dropout = stream(config.seed, name).generate_state(2, np.uint64)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(initial >> np.uint64(1)))
         network = _architecture(config)
+        _check_output(config, network)
     seed_dropout(network, int(dropout >> np.uint64(1)))
     return network
 
@@ -150,9 +174,12 @@ def _architecture(config: cfg.Config) -> nn.Module:
     """A network with weights from the global generator."""
     env, objective = config.env, config.objective
     head: Head = DuelingHead if config.model.head == "dueling" else nn.Linear
-    if isinstance(objective, cfg.QuantileConfig):
-        head = partial(QuantileHead, quantiles=objective.quantiles)
-    return NETWORKS[type(config.model)]((env.stack, env.size, env.size), len(ACTIONS), head)
+    if objective.component is None:
+        raise ConfigError(needs(config))
+    if config.model.head == "quantile":
+        head = partial(QuantileHead, quantiles=objective.settings["quantiles"])
+    network: nn.Module = build_component(config, config.model, (env.stack, env.size, env.size), len(ACTIONS), head)
+    return network
 
 
 def build_optimizer(optimizer: cfg.AdamConfig | cfg.RmsPropConfig, network: nn.Module) -> torch.optim.Optimizer:
@@ -177,13 +204,15 @@ def build_learner(config: cfg.Config) -> Learner:
     target_network = build_network(config, "target").to(device)
     if target.start == "copy":
         target_network.load_state_dict(network.state_dict())
-    shards = threads if device.type == "cpu" and splits(network) else 1
+    component = config.model.component
+    is_split = component is not None and component.facts["splits_batches"]
+    shards = threads if device.type == "cpu" and is_split else 1
     torch.set_num_threads(threads // shards)
     return Learner(
         network,
         target_network,
         build_optimizer(config.optimizer, network),
-        OBJECTIVES[config.objective.name](),
+        build_component(config, config.objective),
         target.tau,
         target_every=target.every,
         precision=choose_precision(config.training.precision, device),  # type: ignore[arg-type]
@@ -201,28 +230,18 @@ def _compiled(network: nn.Module) -> nn.Module:
     return cast(nn.Module, torch.compile(network, dynamic=False, mode="reduce-overhead" if on_gpu else None))
 
 
-def build_schedule(schedule: cfg.EpsilonConfig | cfg.LrScheduleConfig) -> Schedule:
-    """A function of the training's progress."""
-    settings = to_dict(schedule)
-    del settings["name"]
-    built: Schedule = SCHEDULES[type(schedule)](**settings)
-    return built
-
-
 def build_plan(config: cfg.Config) -> Plan:
     """Phases, schedules and learning cadence."""
     objective = config.objective
     phases = []
     for name, phase in config.phase.items():
-        sampler = to_dict(config.sampler_of(name))
-        del sampler["name"]
-        built = SAMPLERS[type(config.sampler_of(name))](**sampler)
-        phases.append(Phase(name, phase.episodes or phase.steps or 0, phase.lr, built))
+        sampler = build_component(config, config.sampler_of(name))
+        phases.append(Phase(name, phase.episodes or phase.steps or 0, phase.lr, sampler))
     return Plan(
         unit="episodes" if next(iter(config.phase.values())).episodes else "steps",
         phases=phases,
-        epsilon=build_schedule(config.epsilon),
-        learning_rate=build_schedule(config.lr_schedule),
+        epsilon=build_component(config, config.epsilon),
+        learning_rate=build_component(config, config.lr_schedule),
         returns=Returns(objective.gamma, objective.n_step, objective.reward_scale, objective.reward_clip),
         terminal_on_life_loss=objective.terminal_on_life_loss,
         learn_every=config.training.learn_every,
@@ -243,6 +262,8 @@ def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Acto
             _architecture(config).load_state_dict(tensors, assign=True)
         learner = build_learner(dataclasses.replace(config, device=device, compile=False))
         learner.load_state_dict({**learner.state_dict(), "network": tensors})
+    except Fault:  # of a plugin
+        raise
     except (SafetensorError, RuntimeError) as error:
         raise Fault(f"the weights are damaged or another network's: {' '.join(str(error).split())}") from error
     return EpsilonGreedy(learner.q_values, len(ACTIONS), watches=True)

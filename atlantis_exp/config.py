@@ -4,14 +4,22 @@ A plain nested mapping enters, a checked `Config` leaves. Knows no Hydra and no 
 stored run passes through the same door as one typed on a command line.
 """
 
-from typing import Annotated, Any, Literal
+import dataclasses
+import json
+import re
+from collections.abc import Collection, Mapping
+from dataclasses import MISSING, field
+from functools import cache
+from keyword import iskeyword
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, PlainValidator, TypeAdapter, ValidationInfo
 from pydantic.dataclasses import dataclass
+from pydantic_core import PydanticKnownError
 
 from atlantis_exp.checking import check_server, digest, nearest, seconds, to_dict
+from atlantis_exp.components import KINDS, NAME, Component, Plugin, known
 from atlantis_exp.faults import ConfigError
-from atlantis_exp.registry import SMALLEST_SIDE
 
 STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
@@ -25,6 +33,9 @@ NonNegative = Annotated[float, Field(ge=0)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Share = Annotated[float, Field(gt=0, lt=1)]
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
+
+FREE = frozenset(("plugins", "resume", "device", "threads", "compile", "tracking", "budget", "paths"))
+"""The keys that say how a run is done; of `plugins`, those that its components are of are part of what is trained."""
 
 _LONGEST = 10 * 365 * 24 * 3600  # seconds
 
@@ -67,34 +78,27 @@ class EnvConfig:
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
-class _NetworkConfig:
+class ComponentConfig:
+    """A component by name, and its settings: the fields that a subclass adds are its constructor's arguments."""
+
+    component: ClassVar[Component | None] = None  # None where it is a plugin's that no command line names
+    own: ClassVar[tuple[str, ...]] = ()
+    """The names of the settings."""
+
     name: str
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the component's constructor takes."""
+        return {name: getattr(self, name) for name in self.own}
+
+
+@dataclass(config=STRICT, kw_only=True, frozen=True)
+class ModelConfig(ComponentConfig):
+    """A network."""
+
     input_size: Size  # pixels
     head: Literal["plain", "dueling", "quantile"]
-
-
-@dataclass(config=STRICT, kw_only=True, frozen=True)
-class CnnConfig(_NetworkConfig):
-    """DQNCnn, report figure 2.1."""
-
-    name: Literal["cnn"]
-
-
-@dataclass(config=STRICT, kw_only=True, frozen=True)
-class ResNetConfig(_NetworkConfig):
-    """ResNetDQN, report figure 2.2."""
-
-    name: Literal["resnet"]
-
-
-@dataclass(config=STRICT, kw_only=True, frozen=True)
-class ResNetFastConfig(_NetworkConfig):
-    """ResNetFast, a residual network at a tenth of ResNetDQN's cost."""
-
-    name: Literal["resnet_fast"]
-
-
-ModelConfig = Annotated[CnnConfig | ResNetConfig | ResNetFastConfig, Field(discriminator="name")]
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -108,32 +112,15 @@ class TargetConfig:
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
-class _BootstrapConfig:
-    name: str
+class ObjectiveConfig(ComponentConfig):
+    """The bootstrap target and its loss."""
+
     gamma: Annotated[float, Field(ge=0, lt=1)]
     n_step: Annotated[int, Field(ge=1, le=1_000)]  # rewards before the bootstrap
     reward_scale: Positive
     reward_clip: Positive | None  # after scaling; null: not clipped
     terminal_on_life_loss: bool
     target: TargetConfig
-
-
-@dataclass(config=STRICT, kw_only=True, frozen=True)
-class DqnConfig(_BootstrapConfig):
-    """The bootstrap target of one value, and its loss."""
-
-    name: Literal["dqn", "double_dqn"]
-
-
-@dataclass(config=STRICT, kw_only=True, frozen=True)
-class QuantileConfig(_BootstrapConfig):
-    """The bootstrap target of a distribution's quantiles, and its loss."""
-
-    name: Literal["quantile", "double_quantile"]
-    quantiles: Annotated[int, Field(ge=1, le=10_000)]
-
-
-ObjectiveConfig = Annotated[DqnConfig | QuantileConfig, Field(discriminator="name")]
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -162,87 +149,105 @@ class RmsPropConfig:
 OptimizerConfig = Annotated[AdamConfig | RmsPropConfig, Field(discriminator="name")]
 
 
-@dataclass(config=STRICT, kw_only=True, frozen=True)
-class ExponentialConfig:
-    """Exponential decay of epsilon, report figure 4.1."""
-
-    name: Literal["exponential"]
-    start: Probability
-    end: Probability
-    decay: Positive  # share of the training
+class SamplerConfig(ComponentConfig):
+    """What chooses a batch's transitions."""
 
 
-@dataclass(config=STRICT, kw_only=True, frozen=True)
-class LinearConfig:
-    """Linear decay."""
+class EpsilonConfig(ComponentConfig):
+    """A schedule of epsilon."""
 
-    name: Literal["linear"]
-    start: Probability
-    end: Probability
-    duration: Positive  # share of the training
+
+class LrScheduleConfig(ComponentConfig):
+    """A schedule of the learning rate's factor."""
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
-class LinearStepsConfig:
-    """Linear decay of epsilon over a number of steps."""
+class PluginConfig:
+    """A plugin that a run was trained with, as it was then."""
 
-    name: Literal["linear_steps"]
-    start: Probability
-    end: Probability
-    steps: Count
+    version: Annotated[str, Field(pattern=r"^[\w.+!-]{1,60}$")] | None  # of the distribution; null: a file
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
-@dataclass(config=STRICT, kw_only=True, frozen=True)
-class ConstantConfig:
-    """The same value throughout."""
+Plugins = dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_][\w.-]{0,99}$")], PluginConfig]
 
-    name: Literal["constant"]
-    value: Probability
+_MOST_SETTINGS = 100  # of a component that is not known here
+_Value = bool | Annotated[int, Field(ge=-(2**63), lt=2**63)] | float | str | None
 
 
-EpsilonConfig = Annotated[
-    ExponentialConfig | LinearConfig | LinearStepsConfig | ConstantConfig, Field(discriminator="name")
-]
+@cache
+def _schema(kind: str, component: Component) -> TypeAdapter[ComponentConfig]:
+    """What checks the config of a component whose class is known."""
+    types = {each.name: each.type for each in component.settings}
+    defaults = {each.name: each.default for each in component.settings if each.default is not MISSING}
+    return _made(kind, types, {**defaults, "component": component})
 
 
-@dataclass(config=STRICT, kw_only=True, frozen=True)
-class OneCycleConfig:
-    """1Cycle (Smith and Topin 2018)."""
-
-    name: Literal["one_cycle"]
-    start: Probability
-    end: Probability
-    rise: Share
+def _unknown_schema(kind: str, names: Collection[str]) -> TypeAdapter[ComponentConfig]:
+    """What checks the config of a component whose class nobody has named here: plain values, which can be compared."""
+    if len(names) > _MOST_SETTINGS or any(iskeyword(name) or not re.fullmatch(NAME, name) for name in names):
+        raise ConfigError(f"{kind}: has no settings of a component, or more than {_MOST_SETTINGS}")
+    return _made(kind, dict.fromkeys(names, _Value | list[_Value]), {})
 
 
-LrScheduleConfig = Annotated[ConstantConfig | LinearConfig | OneCycleConfig, Field(discriminator="name")]
+def _made(kind: str, types: Mapping[str, Any], attributes: Mapping[str, Any]) -> TypeAdapter[ComponentConfig]:
+    """A schema of a kind with further fields."""
+    body = {**attributes, "own": tuple(types), "__annotations__": dict(types), "__module__": __name__}
+    schema: Any = dataclass(config=STRICT, kw_only=True, frozen=True)(type("Settings", (_BASES[kind],), body))
+    return TypeAdapter(schema)
 
 
-@dataclass(config=STRICT, kw_only=True, frozen=True)
-class UniformConfig:
-    """Every stored transition alike."""
-
-    name: Literal["uniform"]
-
-
-@dataclass(config=STRICT, kw_only=True, frozen=True)
-class TopHalfConfig:
-    """Draw `oversample` batches, keep the one with the highest rewards (report section 4)."""
-
-    name: Literal["top_half"]
-    oversample: Annotated[int, Field(ge=2, le=64)]
+_BASES: dict[str, type[ComponentConfig]] = {
+    "model": ModelConfig,
+    "sampler": SamplerConfig,
+    "objective": ObjectiveConfig,
+    "epsilon": EpsilonConfig,
+    "lr_schedule": LrScheduleConfig,
+}
 
 
-@dataclass(config=STRICT, kw_only=True, frozen=True)
-class PrioritizedConfig:
-    """Likelier where the last error was larger (Schaul et al. 2016, proportional)."""
+def _component(kind: str) -> PlainValidator:
+    """What reads the config of a component of a kind, by the schema that its class says it has."""
+    base = _BASES[kind]
+    common = {each.name for each in dataclasses.fields(base)}
 
-    name: Literal["prioritized"]
-    alpha: Probability
-    beta: Probability
+    def read(tree: Any, info: ValidationInfo) -> ComponentConfig:
+        if isinstance(tree, base):
+            return tree
+        if not isinstance(tree, dict):
+            raise PydanticKnownError("dataclass_type", {"class_name": base.__name__})
+        if not isinstance(name := tree.get("name"), str):
+            raise PydanticKnownError("union_tag_not_found", {"discriminator": "'name'"})
+        component, plugins = known(kind).get(name), info.data.get("plugins") or {}
+        if component is not None and (component.plugin is None or _is_recorded(component.plugin, plugins)):
+            schema = _schema(kind, component)
+        elif plugins and re.fullmatch(NAME, name):
+            schema = _unknown_schema(kind, [*(tree.keys() - common)])
+        else:
+            tags = ", ".join(f"'{each}'" for each in known(kind))
+            raise PydanticKnownError(
+                "union_tag_invalid", {"discriminator": "'name'", "tag": name, "expected_tags": tags}
+            )
+        # Through JSON, as in `checking.parse`.
+        return schema.validate_json(json.dumps(tree))
+
+    return PlainValidator(read)
 
 
-SamplerConfig = Annotated[UniformConfig | TopHalfConfig | PrioritizedConfig, Field(discriminator="name")]
+def _is_recorded(plugin: Plugin, plugins: Mapping[str, PluginConfig]) -> bool:
+    recorded = plugins.get(plugin.name)
+    return recorded is not None and (recorded.version, recorded.sha256) == (plugin.version, plugin.sha256)
+
+
+def record_plugins(tree: dict[str, Any]) -> None:
+    """Write into a composed config which of the admitted plugins its components are of."""
+    samplers = tree["samplers"] if isinstance(tree.get("samplers"), dict) else {}
+    named = [(kind, tree.get(kind)) for kind in KINDS] + [("sampler", each) for each in samplers.values()]
+    found = (known(kind).get(str(part.get("name"))) for kind, part in named if isinstance(part, dict))
+    plugins = {each.plugin.name: each.plugin for each in found if each is not None and each.plugin is not None}
+    tree["plugins"] = {
+        name: {"version": plugin.version, "sha256": plugin.sha256} for name, plugin in sorted(plugins.items())
+    }
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -344,6 +349,7 @@ class BaselineAgentConfig:
 class Config:
     """One training experiment."""
 
+    plugins: Plugins = field(default_factory=dict)  # that its components are of; first, since the others need it
     seed: Seed
     resume: Literal["auto", "never", "must"]
     device: Device
@@ -352,13 +358,13 @@ class Config:
     training: TrainingConfig
     replay: ReplayConfig
     env: EnvConfig
-    model: ModelConfig
-    objective: ObjectiveConfig
+    model: Annotated[ModelConfig, _component("model")]
+    objective: Annotated[ObjectiveConfig, _component("objective")]
     optimizer: OptimizerConfig
-    lr_schedule: LrScheduleConfig
-    epsilon: EpsilonConfig
-    samplers: dict[str, SamplerConfig]
-    sampler: SamplerConfig
+    lr_schedule: Annotated[LrScheduleConfig, _component("lr_schedule")]
+    epsilon: Annotated[EpsilonConfig, _component("epsilon")]
+    samplers: dict[str, Annotated[SamplerConfig, _component("sampler")]]
+    sampler: Annotated[SamplerConfig, _component("sampler")]
     phase: dict[str, PhaseConfig]
     evaluation: EvaluationConfig
     tracking: TrackingConfig
@@ -366,15 +372,16 @@ class Config:
     paths: PathsConfig
 
     def __post_init__(self) -> None:
-        if self.env.size < (smallest := SMALLEST_SIDE[self.model.name]):
+        network, objective = self.model.component, self.objective.component
+        if network is not None and self.env.size < (smallest := network.facts["smallest_side"]):
             raise ConfigError(
                 f"env.size={self.env.size}: model '{self.model.name}' needs at least {smallest} pixels; "
                 f"it is made for {self.model.input_size}"
             )
-        if isinstance(self.objective, QuantileConfig) != (self.model.head == "quantile"):
+        if objective is not None and (objective.facts["head"] == "quantile") != (self.model.head == "quantile"):
             raise ConfigError(
                 f"model.head={self.model.head}: does not go with objective.name={self.objective.name}; "
-                "model.head=quantile and objective=quantile or double_quantile need each other"
+                f"model.head=quantile and objective={' or '.join(_with_quantiles())} need each other"
             )
         if self.training.batch_size > self.replay.capacity:
             raise ConfigError(
@@ -400,7 +407,7 @@ class Config:
         if len({phase.steps is None for phase in self.phase.values()}) > 1:
             raise ConfigError("phase: all phases must have their length in the same unit, episodes or steps")
 
-    def sampler_of(self, phase: str) -> UniformConfig | TopHalfConfig | PrioritizedConfig:
+    def sampler_of(self, phase: str) -> SamplerConfig:
         """The sampler that a phase names; the chosen one takes precedence over a library one of the same name."""
         name = self.phase[phase].sampler
         return self.sampler if name == self.sampler.name else self.samplers[name]
@@ -408,12 +415,14 @@ class Config:
     def science(self) -> dict[str, Any]:
         """What decides the run's numbers: all but tracking, budget, places, devices and process counts."""
         tree = to_dict(self)
-        for key in ("resume", "device", "threads", "compile", "tracking", "budget", "paths", "samplers", "sampler"):
+        for key in (FREE - {"plugins"}) | {"samplers", "sampler"}:
             del tree[key]
         del tree["env"]["workers"]
         tree["evaluation"]["video"] = bool(tree["evaluation"]["video"])  # what is filmed of a game is no part of it
         if tree["training"]["ema"] is None:  # a run from before there was the key stays itself
             del tree["training"]["ema"]
+        if not self.plugins:
+            del tree["plugins"]
         # A list, since the order of phases counts and their names do not.
         tree["phase"] = [{**phase, "sampler": to_dict(self.sampler_of(name))} for name, phase in tree["phase"].items()]
         return tree
@@ -426,3 +435,7 @@ class Config:
         """What differs, readably, and the identity, which alone decides."""
         samplers = [phase.sampler for phase in self.phase.values()]
         return f"{self.model.name}-{'-'.join(dict.fromkeys(samplers))}-s{self.seed}-{self.identity()}"
+
+
+def _with_quantiles() -> list[str]:
+    return [name for name, each in known("objective").items() if each.facts["head"] == "quantile"]

@@ -1,12 +1,5 @@
 """Names and facts that are needed before torch and numpy are there."""
 
-SMALLEST_SIDE = {
-    "cnn": 36,  # 36 -> 8 -> 3 -> 1
-    "resnet": 15,  # 15 -> 7 -> 5 -> 3 -> 1
-    "resnet_fast": 8,  # 8 -> 1
-}
-"""The pixels a side that a network's unpadded convolutions need."""
-
 SOURCES = ("centre_vessel", "side_vessel", "centre_bomber", "side_bomber", "wave_bonus")
 """What pays points in Atlantis.
 

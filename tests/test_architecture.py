@@ -14,12 +14,13 @@ from atlantis_exp.learning.learner import Learner
 
 PACKAGE = Path(__file__).resolve().parents[1] / "atlantis_exp"
 WINGS = {"game", "replay", "networks", "learning"}  # which know nothing of each other, nor of any config
-MODULES = {"config", "checking", "faults", "registry", "decision", "statistics", "media", "terminal"}
+MODULES = {"config", "checking", "components", "faults", "registry", "decision", "statistics", "media", "terminal"}
 GROUND = WINGS | MODULES
 MAY: dict[str, Set[str]] = {  # whatever else of the package each may import
     **dict.fromkeys(("faults", "registry", "decision", "statistics", "media", "terminal"), frozenset[str]()),
     "checking": {"faults"},
-    "config": {"checking", "faults", "registry"},
+    "components": {"checking", "faults"},
+    "config": {"checking", "components", "faults"},
     **dict.fromkeys(WINGS, MODULES - {"config", "checking"}),
     "runs": MODULES,
     "tracking": {"runs"} | MODULES,
@@ -35,6 +36,7 @@ ROOMS = {  # the only places that may name a library, or read what a person type
     "hydra": ("commands",),
     "omegaconf": ("commands",),
     "sys.argv": ("commands",),
+    "atlantis_exp.components.admit": ("commands",),  # nothing but a command line lets a plugin in
     "torch": ("networks", "learning", "training", "build", "sessions"),
     "safetensors.torch": ("networks", "learning", "training", "build", "sessions"),
 }
@@ -124,6 +126,10 @@ def test_no_arrow_goes_up_or_across_and_libraries_stay_in_their_rooms(module: st
         ("sessions.training", "from atlantis_exp.commands.app import Verb", "sessions.training imports commands"),
         ("sessions.launchers.ray", "import hydra", "sessions.launchers.ray imports hydra"),
         ("sessions.job", "import sys\ncommand = sys.argv[1:]", "sessions.job imports sys.argv"),
+        (
+            *("sessions.cards", "from atlantis_exp.components import admit"),
+            "sessions.cards imports atlantis_exp.components.admit",
+        ),
         ("sessions.job", "from sys import argv", "sessions.job imports sys.argv"),
         ("commands.train", "import torch", "commands.train imports torch"),
         ("commands.train", "from atlantis_exp import __main__", "commands.train imports __main__"),
@@ -138,7 +144,7 @@ def test_the_check_lets_arrows_down_pass() -> None:
     assert violations("training.trainer", "from atlantis_exp.media import film") == []
     assert violations("training.recorder", "from atlantis_exp.runs.journal import Tracker") == []
     assert violations("game.vector", "from atlantis_exp.game.emulator import Emulator") == []
-    assert violations("networks.cnn", "import torch\nfrom atlantis_exp.registry import SMALLEST_SIDE") == []
+    assert violations("networks.cnn", "import torch\nfrom atlantis_exp.components import component") == []
     assert violations("tracking.store", "import mlflow") == []
     assert violations("comparison.comparing", "from atlantis_exp.tracking.publishing import publishing") == []
     assert violations("sessions.job", "import sys, safetensors.numpy\nsys.exit(1)") == []

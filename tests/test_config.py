@@ -8,10 +8,9 @@ from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 from atlantis_exp.checking import flatten, parse, to_dict
-from atlantis_exp.commands.composing import CONF
+from atlantis_exp.commands.composing import CONF, checked
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 
@@ -21,9 +20,7 @@ Tree = dict[str, Any]
 @cache  # Hydra takes a third of a second
 def composed_tree(*overrides: str) -> Tree:
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        tree = OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
-    assert isinstance(tree, dict)
-    return {str(key): value for key, value in tree.items()}
+        return to_dict(checked(Config, compose("config", list(overrides))))
 
 
 TREES = {

@@ -16,12 +16,11 @@ import torch
 from hydra import compose, initialize_config_dir
 from rich.console import Console
 
-from atlantis_exp.build import NETWORKS, build_baseline, build_plan, make_emulator
+from atlantis_exp.build import build_baseline, build_plan, make_emulator
 from atlantis_exp.commands.baseline import BaselineConfig
 from atlantis_exp.commands.composing import CONF, checked
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
-from atlantis_exp.registry import SMALLEST_SIDE
 from atlantis_exp.runs.journal import NullJournal
 from atlantis_exp.sessions.job import replaced
 from atlantis_exp.training.plan import Counters
@@ -182,10 +181,11 @@ def test_every_option_of_agent_is_the_player_it_names(option: str) -> None:
     assert (type(actor).__name__, attributes(actor, settings)) == (name, settings)
 
 
-@pytest.mark.parametrize("name", SMALLEST_SIDE)
+@pytest.mark.parametrize("name", BUILT["model"])
 def test_a_config_asks_for_as_many_pixels_as_its_network_needs(name: str) -> None:
-    network: Any = NETWORKS[type(composed(f"model={name}").model)]
-    smallest = SMALLEST_SIDE[name]
+    component = composed(f"model={name}").model.component
+    assert component is not None
+    network, smallest = component.load(), component.facts["smallest_side"]
     assert network.smallest_side == smallest
     network((4, smallest, smallest), 4, torch.nn.Linear)
     with pytest.raises(ValueError, match=f"needs {smallest} pixels"):

@@ -17,6 +17,8 @@ VERBS = {
     "decide": "the question itself: trains the seeds that it needs, stops when it is answered: model=cnn,resnet_fast",
     "compare": "finished runs as groups: intervals, a verdict, a page of figures: by=model,sampler",
     "query": "what the environment is, and what this config makes of it",
+    "check": "do components keep what the rest relies on, and what do they cost: model=mynet plugins=./mynet.py",
+    "new": "a package with a component of your own, to begin with: model=mynet to=FOLDER",
     "verify-resume": "proves, for any training, that killing and continuing it changes no bit",
     "report": "the results that the outputs folder holds, as a table",
     "sync": "run folders into an MLflow store; to=URI to a server, from=URI from one, every=30s until interrupted",

@@ -12,8 +12,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from atlantis_exp.commands.composing import CONF, checked
-from atlantis_exp.commands.overrides import check, launcher, refuse_twice
+from atlantis_exp.commands.composing import CONF, admit, checked
+from atlantis_exp.commands.overrides import check, launcher, located, refuse_twice
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.sessions.job import command_line
 from atlantis_exp.sessions.launchers import Launcher, job_apart
@@ -59,17 +59,21 @@ class Verb(Generic[T]):
         A user's mistake ends the process with exit code 2 and one line on stderr before Hydra or the work starts; a
         `Fault` ends it with its own exit code and one line, and so does a folder that cannot be written.
         """
-        config_name, typed = self.config_name or self.name, tuple(arguments)
+        config_name = self.config_name or self.name
         try:
+            admit([])  # an earlier command of this process may have named plugins
+            arguments = located(arguments)
+            typed = tuple(arguments)
             refuse_twice(arguments := self.rewrite(arguments))
             jobs = check(config_name, self.schema, arguments)
             chosen = launcher(config_name, arguments)
+            flags = tuple(text for text in arguments if text.startswith("--config-dir="))
         except ConfigError as error:
             exit_with(error)
 
         @hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)
         def task(composed: DictConfig) -> None:
-            overrides = tuple(HydraConfig.get().overrides.task)
+            overrides = (*flags, *HydraConfig.get().overrides.task)
             try:
                 config = checked(self.schema, composed)
                 self.work(Asked(config, self.name, overrides, _job_launcher(), typed))()
@@ -81,7 +85,7 @@ class Verb(Generic[T]):
 
         sys.argv[1:] = arguments  # which Hydra reads
         os.environ.setdefault("HYDRA_FULL_ERROR", "1")
-        asked = [Asked(config, self.name, overrides) for overrides, config in jobs.items()]
+        asked = [Asked(config, self.name, (*flags, *overrides)) for overrides, config in jobs.items()]
         is_sweep = len(asked) > 1 or not chosen.is_basic
         try:
             with self.sweep(asked, chosen, arguments) if is_sweep else nullcontext():

@@ -3,17 +3,30 @@
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import MISSING
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from hydra import initialize_config_dir
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path
+from hydra.core.config_search_path import SearchPathQuery
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
+from atlantis_exp import components
 from atlantis_exp.checking import parse
 from atlantis_exp.commands import VERBS
+from atlantis_exp.config import Config, record_plugins
+from atlantis_exp.faults import ConfigError
 
 T = TypeVar("T")
+
+_LIKE = {"model": "cnn", "objective": "dqn"}
+"""Of each kind whose components have keys besides their settings, ours with these alone."""
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent
@@ -28,7 +41,13 @@ def _outputs_folder() -> str:
 def _help(config_name: str) -> str:
     verb = "train" if config_name == "config" else config_name
     verbs = "\n".join(f"  {verb:15}{purpose}" for verb, purpose in VERBS.items())
-    return f"python -m atlantis_exp {verb} KEY=VALUE ...\n{VERBS[verb]}\n\n== Verbs ==\n{verbs}\n"
+    own = "".join(
+        f"  plugins={name} ({parts[0].plugin}): {', '.join(f'{part.kind}={part.name}' for part in parts)}\n"
+        for name, parts in components.installed().items()
+        if parts
+    )
+    plugins = f"\n== Plugins ==\n{own}" if own else ""
+    return f"python -m atlantis_exp {verb} KEY=VALUE ...\n{VERBS[verb]}\n\n== Verbs ==\n{verbs}\n{plugins}"
 
 
 # Our presets reuse the plugins' names so that the plugins validate the keys; Hydra warns.
@@ -37,29 +56,77 @@ OmegaConf.register_new_resolver("outputs_folder", _outputs_folder, replace=True)
 OmegaConf.register_new_resolver("help", _help, replace=True)
 # Of a Ray cluster that is started here, bytes, the least that Ray takes; a running cluster (a string) has its own.
 OmegaConf.register_new_resolver("ray_object_store", lambda address: None if address else 78_643_200, replace=True)
-# The head that an objective needs, unless a person asks for another.
-OmegaConf.register_new_resolver(
-    "head_for", lambda objective, other="plain": "quantile" if objective.endswith("quantile") else other, replace=True
-)
+
+
+def _head_for(objective: str, other: str = "plain") -> str:
+    """The head that an objective needs, unless a person asks for another."""
+    component = components.known("objective").get(objective)
+    return other if component is None or component.facts["head"] == "plain" else str(component.facts["head"])
+
+
+OmegaConf.register_new_resolver("head_for", _head_for, replace=True)
 
 
 def checked(schema: type[T], composed: DictConfig) -> T:
-    """A composed Hydra config as an instance of its schema class. Raises: ConfigError."""
-    tree = OmegaConf.to_container(composed, resolve=True)
-    assert isinstance(tree, dict)
+    """A composed Hydra config as an instance of its schema class, its plugins admitted. Raises: ConfigError."""
+    admit(composed.get("plugins"))
+    composition = OmegaConf.to_container(composed, resolve=True)
+    assert isinstance(composition, dict)
+    tree = {str(key): value for key, value in composition.items() if key != "plugins"}
+    if issubclass(schema, Config):
+        record_plugins(tree)
     paths = tree.get("paths")
     if isinstance(paths, dict) and isinstance(paths.get("outputs"), str) and paths["outputs"]:
         paths["outputs"] = str(Path(paths["outputs"]).expanduser().absolute())
-    return parse(schema, {str(key): value for key, value in tree.items()})
+    return parse(schema, tree)
+
+
+def admit(plugins: Any) -> None:
+    """Admit the plugins that the key `plugins` holds, and make their components options. Raises: ConfigError."""
+    references = [plugins] if isinstance(plugins, str) else plugins or []
+    if isinstance(references, dict | DictConfig) or not all(isinstance(each, str) for each in references):
+        raise ConfigError(f"plugins={plugins}: write files and distributions, as in plugins=[./mynet.py,mypackage]")
+    components.admit(references)
+    for component in components.admitted().values():
+        ConfigStore.instance().store(name=component.name, group=component.kind, node=_option(component))
+
+
+def _option(component: components.Component) -> dict[str, Any]:
+    """What choosing a plugin's component puts into the config: its constructor's defaults and, over them, its YAML."""
+    node: dict[str, Any] = {"defaults": [_LIKE[component.kind], "_self_"]} if component.kind in _LIKE else {}
+    node["name"] = component.name
+    if component.kind == "model":
+        node["input_size"] = component.facts["input_size"]
+    node |= {each.name: "???" if each.default is MISSING else each.default for each in component.settings}
+    path = component.source.path.parent / "conf" / component.kind / f"{component.name}.yaml"
+    if path.is_file():
+        try:
+            values = OmegaConf.to_container(OmegaConf.load(path))
+        except (OSError, UnicodeDecodeError, YAMLError, OmegaConfBaseException) as error:
+            raise ConfigError(f"{path}: {' '.join(str(error).split())}") from None
+        if not isinstance(values, dict) or "defaults" in values:
+            raise ConfigError(f"{path}: should hold settings, KEY: VALUE a line, and no defaults list")
+        if values.setdefault("name", component.name) != component.name:
+            raise ConfigError(f"{path}: name should be {component.name}, as the file is called")
+        node |= {str(key): value for key, value in values.items()}
+    return node
 
 
 @contextmanager
-def composing() -> Iterator[None]:
-    """Let `compose` compose from the config groups, inside of one of Hydra's jobs too."""
+def composing(own: Path | None = None) -> Iterator[None]:
+    """Let `compose` compose from the config groups, inside of one of Hydra's jobs too.
+
+    own: a folder with further options, as Hydra's `--config-dir` takes it.
+    """
     under_way = GlobalHydra.instance().hydra  # of the job that asks; there can be only one at a time
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
+            if own is not None:  # as `hydra.main` takes it: behind ours, ahead of plugins' options
+                path = create_config_search_path(str(CONF))
+                path.prepend("command-line", f"file://{own}", SearchPathQuery(provider="schema"))
+                GlobalHydra.instance().clear()
+                Hydra.create_main_hydra2("app", path)
             yield
     finally:
         GlobalHydra.instance().hydra = under_way

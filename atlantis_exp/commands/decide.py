@@ -13,7 +13,7 @@ from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.compare import margin
 from atlantis_exp.commands.jobs import training_of
 from atlantis_exp.commands.overrides import check, read_flags, read_override, swept
-from atlantis_exp.config import STRICT, Config
+from atlantis_exp.config import FREE, STRICT, Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import command_line
 
@@ -38,7 +38,7 @@ class DecideConfig(Config):
 
 
 _OWN = {field.name for field in dataclasses.fields(DecideConfig)} - {field.name for field in dataclasses.fields(Config)}
-_CLOSED = _OWN | {"seed", "resume", "device", "threads", "compile", "evaluation", "tracking", "budget", "paths"}
+_CLOSED = _OWN | FREE | {"seed", "evaluation"}
 _LAUNCHER = ("hydra/launcher=", "hydra.launcher.")
 
 
@@ -88,7 +88,8 @@ def request_of(asked: Asked[DecideConfig]) -> "Request":
     texts = read_flags(asked.typed)[0]  # as typed: Hydra has put values in the place of ${...}
     shared = [text for text in texts if text not in several and not text.startswith(("hydra.", "hydra/"))]
     fixed = [text for text in shared if text.lstrip("+~").split("=")[0].split(".")[0] not in _OWN]
-    launcher = [text for text in asked.typed if text.startswith(_LAUNCHER)]
+    flags = [text for text in asked.typed if text.startswith("--config-dir=")]
+    launcher = [*flags, *(text for text in asked.typed if text.startswith(_LAUNCHER))]
     check("config", Config, ["-m", *launcher, *several, *fixed])
     delta, relative = margin(config.delta)
     keys = tuple(read_override(text).key_or_group for text in several)
@@ -98,7 +99,7 @@ def request_of(asked: Asked[DecideConfig]) -> "Request":
         several=several,
         fixed=fixed,
         launcher=launcher,
-        job_of=cache(training_of),
+        job_of=cache(lambda overrides: training_of([*flags, *overrides])),
         command=command_line("decide", *asked.typed),
     )
 

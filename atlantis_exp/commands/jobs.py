@@ -5,12 +5,11 @@ from collections.abc import Sequence
 
 from atlantis_exp.checking import digest
 from atlantis_exp.commands.app import Asked
-from atlantis_exp.commands.overrides import check, read_override
-from atlantis_exp.config import Config
+from atlantis_exp.commands.overrides import check, read_flags, read_override
+from atlantis_exp.config import FREE, Config
 from atlantis_exp.sessions.job import Job
 
 _SAID = ("model", "sampler", "seed")  # by a title anyway
-_UNSAID = ("resume", "device", "threads", "compile", "tracking", "budget", "paths")  # no part of what is trained
 _BARE = ("experiment", "objective", "optimizer", "epsilon", "env")  # groups whose options speak for themselves
 _SPELLED = 4  # values at most; beyond them a few digits of their hash tell runs apart
 
@@ -28,12 +27,12 @@ def words_of(overrides: Sequence[str]) -> tuple[str, ...]:
     """
     options: dict[str, str] = {}
     values: dict[str, str] = {}
-    for text in overrides:
+    for text in read_flags(overrides)[0]:
         override = read_override(text)
         key, value = override.get_key_element().lstrip("+"), override.value()
         word = "" if override.is_delete() else value if isinstance(value, str) else json.dumps(value)
         root = key.lstrip("~").split(".")[0]
-        if key in _SAID or root in _UNSAID or key in ("env.workers",) or word == "none":
+        if key in _SAID or root in FREE or key in ("env.workers",) or word == "none":
             continue
         if key in _BARE:
             options[key] = word

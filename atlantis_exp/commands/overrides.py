@@ -4,9 +4,10 @@ import argparse
 import itertools
 import re
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import TypeVar
 
 from hydra import compose
@@ -18,7 +19,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
 from atlantis_exp.checking import flatten, nearest
-from atlantis_exp.commands.composing import CONF, checked, composing
+from atlantis_exp.commands.composing import CONF, admit, checked, composing
+from atlantis_exp.components import KINDS, admitted, installed
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.launchers import BASIC, Launcher
 
@@ -40,11 +42,21 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
     for override in hydras:
         _refuse_hydras(override)
     overrides = [override for override in overrides if not _is_hydras(override)]
+    admit(next((override.value() for override in overrides if override.key_or_group == "plugins"), []))
+    own = config_dir(arguments)
+    if own is not None:
+        _check_config_dir(own)
+    if own is not None or admitted():  # whose files may have changed
+        _composed.cache_clear()
+        _keys.cache_clear()
     try:
-        with composing():
+        with composing(own):
             if hydras:
                 _check_launcher(config_name, hydras)
-            return {tuple(job): _check_job(config_name, schema, job) for job in _jobs(overrides)}
+            jobs = {tuple(job): _check_job(config_name, schema, job, own) for job in _jobs(overrides)}
+            if own is not None:
+                _refuse_settings_of_hydra(config_name, own, jobs)
+            return jobs
     except (HydraException, OmegaConfBaseException) as error:
         reason = f": {error.__cause__}" if isinstance(error.__cause__, OmegaConfBaseException) else ""
         raise ConfigError(" ".join(re.split("Config search path|full_key:", f"{error}{reason}")[0].split())) from None
@@ -80,7 +92,7 @@ def launcher(config_name: str, arguments: Sequence[str]) -> Launcher:
     hydras = [text for text in texts if _is_hydras(read_override(text))]
     if not multirun or not hydras:
         return BASIC
-    with composing():
+    with composing(config_dir(arguments)):
         settings = compose(config_name, hydras, return_hydra_config=True).hydra
     name, n_jobs = settings.runtime.choices["hydra/launcher"], OmegaConf.select(settings, "launcher.n_jobs")
     if (ray := OmegaConf.select(settings, "launcher.ray.init")) is None:
@@ -114,6 +126,11 @@ def _check_launcher(config_name: str, overrides: list[Override]) -> None:
 
 def read_flags(arguments: Sequence[str]) -> tuple[list[str], bool]:
     """The overrides of a command line, and whether it is a sweep. Raises: ConfigError."""
+    flags = _flags(arguments)
+    return flags.overrides, flags.multirun
+
+
+def _flags(arguments: Sequence[str]) -> argparse.Namespace:
     parser = get_args_parser()
     parser.exit_on_error = parser.allow_abbrev = False
     try:
@@ -129,10 +146,10 @@ def read_flags(arguments: Sequence[str]) -> tuple[list[str], bool]:
         raise ConfigError(
             f"--{'cfg' if flags.cfg else 'info'} {shown}: shows one config; drop -m, and name one value a key"
         )
-    for flag in ("config_path", "config_name", "config_dir", "experimental_rerun"):
+    for flag in ("config_path", "config_name", "experimental_rerun"):
         if getattr(flags, flag) is not None:
             raise ConfigError(f"--{flag.replace('_', '-')}: the verb decides on its config; write overrides instead")
-    return flags.overrides, flags.multirun
+    return flags
 
 
 def read_override(text: str) -> Override:
@@ -166,18 +183,24 @@ def _jobs(overrides: list[Override]) -> Iterator[list[str]]:
         yield list(combination)
 
 
-def _check_job(config_name: str, schema: type[T], texts: list[str]) -> T:
+def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | None) -> T:
     overrides = {text: read_override(text) for text in texts}
     groups = _groups(config_name)
     chosen = tuple(text for text, override in overrides.items() if _key(override) in groups)
     for text in chosen:
         override = overrides[text]
         folder, value = override.key_or_group, override.value()
-        options = {path.stem for path in (CONF / folder).glob("*.yaml")}
+        places = (CONF, own) if own is not None else (CONF,)
+        options = {path.stem for place in places for path in (place / folder).glob("*.yaml")}
+        options |= {component.name for component in admitted().values() if component.kind == folder}
         if override.is_delete():
             raise ConfigError(f"{text}: needed; choose with {folder}=OPTION (valid: {', '.join(sorted(options))})")
         if not isinstance(value, str) or value not in options:
-            raise ConfigError(f"{folder}={value}: no such option in conf/{folder}; {nearest(str(value), options)}")
+            hint = "; one of your own needs plugins=./FILE.py" if folder in KINDS and not admitted() else ""
+            raise ConfigError(
+                _offered(folder, str(value))
+                or f"{folder}={value}: no such option in conf/{folder}; {nearest(str(value), options)}{hint}"
+            )
     keys = _keys(config_name, chosen)
     branches = {key.rsplit(".", depth)[0] for key in keys for depth in range(1, key.count(".") + 1)}
     for text, override in overrides.items():
@@ -191,10 +214,78 @@ def _check_job(config_name: str, schema: type[T], texts: list[str]) -> T:
         if override.is_delete() and not key.startswith("phase."):
             raise ConfigError(f"{text}: needed; change it with {key}=VALUE")
     try:
-        return checked(schema, _composed(config_name, tuple(texts)))
+        composed = _composed(config_name, tuple(texts))
+        if OmegaConf.select(composed, "plugins") and "plugins" not in {_key(each) for each in overrides.values()}:
+            raise ConfigError(f"--config-dir={own}: names plugins; only the command line may, as plugins=./FILE.py")
+        return checked(schema, composed)
     except InterpolationKeyError as error:
         missing = "".join(re.findall("'(.*)'", str(error)))
         raise ConfigError(f"${{{missing}}}: no such key; {_nearest_key(missing, keys)}") from None
+
+
+def located(arguments: Sequence[str]) -> list[str]:
+    """Arguments that mean the same in any folder: `--config-dir` and plugins as absolute paths. Raises: ConfigError.
+
+    Plugins are one list however they were written, and `--config-dir` comes first.
+    """
+    arguments = [re.sub(r"^plugins=(.+)$", _located, argument, flags=re.DOTALL) for argument in arguments]
+    if (folder := config_dir(arguments)) is None:
+        return arguments
+    arguments = [argument for argument in arguments if not re.match(r"(--config-dir|-cd)=", argument)]
+    if (flag := next((at for at, text in enumerate(arguments) if text in ("--config-dir", "-cd")), None)) is not None:
+        del arguments[flag : flag + 2]
+    return [f"--config-dir={folder}", *arguments]
+
+
+def config_dir(arguments: Sequence[str]) -> Path | None:
+    """The folder of a person's own options that a command line names. Raises: ConfigError."""
+    folder = _flags(arguments).config_dir
+    return None if folder is None else Path(folder).expanduser().absolute()
+
+
+def _check_config_dir(folder: Path) -> None:
+    """Refuse a folder that is none, or that would be heard on more than the options of groups. Raises: ConfigError."""
+    if not folder.is_dir():
+        raise ConfigError(f"--config-dir={folder}: no such folder")
+    if (folder / "hydra").exists():
+        raise ConfigError(f"--config-dir={folder}: its group hydra/ would name code; only groups of ours are read")
+    for group in sorted(path for path in CONF.iterdir() if path.is_dir()):
+        ours = {path.name for path in group.glob("*.yaml")}
+        if taken := sorted(path for path in (folder / group.name).glob("*.yaml") if path.name in ours):
+            raise ConfigError(f"{taken[0]}: {group.name}={taken[0].stem} is ours and is not replaced; rename yours")
+
+
+def _refuse_settings_of_hydra(config_name: str, folder: Path, jobs: Iterable[Sequence[str]]) -> None:
+    """Raise ConfigError where options of a person's own change what Hydra does, which is to run code."""
+    plain = _hydras_own(config_name, [])
+    for job in jobs:
+        if changed := sorted(key for key, value in _hydras_own(config_name, job).items() if value != plain.get(key)):
+            raise ConfigError(f"--config-dir={folder}: sets hydra.{changed[0]}, which may name code; drop it there")
+
+
+def _hydras_own(config_name: str, texts: Sequence[str]) -> dict[str, object]:
+    settings = OmegaConf.to_container(compose(config_name, list(texts), return_hydra_config=True).hydra, resolve=False)
+    assert isinstance(settings, dict)
+    return {str(key): value for key, value in settings.items() if key not in ("job", "overrides", "runtime")}
+
+
+def _located(match: re.Match[str]) -> str:
+    references = []
+    for text in match[1].removeprefix("[").removesuffix("]").split(","):
+        reference = text.strip().strip("'\"")
+        if "/" in reference or reference.endswith(".py"):
+            reference = str(Path(reference).expanduser().absolute())
+        references.append(reference if re.fullmatch(r"[\w/.+-]+", reference, re.ASCII) else f"'{reference}'")
+    return f"plugins=[{','.join(references)}]"
+
+
+def _offered(folder: str, name: str) -> str:
+    """What to write for an option that an installed distribution offers; empty where none does."""
+    offers = [each for parts in installed().values() for each in parts if (each.kind, each.name) == (folder, name)]
+    if not offers or not offers[0].plugin:
+        return ""
+    plugins = ", ".join(f"plugins={each.plugin.name} ({each.plugin})" for each in offers if each.plugin)
+    return f"{folder}={name}: add {plugins}"
 
 
 @cache

@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.jobs import training_of
 from atlantis_exp.commands.overrides import swept
-from atlantis_exp.config import STRICT, Config, Count
+from atlantis_exp.config import FREE, STRICT, Config, Count
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.sessions.job import command_line
 
@@ -44,7 +44,7 @@ class SearchConfig(Config):
 
 
 _OWN = {field.name for field in dataclasses.fields(SearchConfig)} - {field.name for field in dataclasses.fields(Config)}
-CLOSED = _OWN | {"seed", "resume", "device", "threads", "compile", "evaluation", "tracking", "budget", "paths"}
+CLOSED = _OWN | FREE | {"seed", "evaluation"}
 """What no searched key may begin with."""
 
 

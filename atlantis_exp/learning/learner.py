@@ -32,8 +32,8 @@ class Learner:
 
     With several shards a batch is cut into as many parts, each a thread's own from the states to the gradients. Threads
     then wait for each other once an update, where torch's own wait after every operation: as fast on a quiet machine
-    and several times faster where other programs want the cores too (docs/performance.md). Raises ValueError where the
-    parts would not be independent, since samples meet in batch statistics or masks come from one generator.
+    and several times faster where other programs want the cores too (docs/performance.md). Raises ValueError unless the
+    network's class says `splits_batches`: samples must meet in no batch statistics, masks come from no one generator.
 
     The network is in eval mode but for its pass over s_t: acting draws no dropout mask and moves no running statistics.
     The target network is in eval mode too, and its running statistics follow the network's as its parameters do. The
@@ -71,8 +71,8 @@ class Learner:
         self.tau = tau  # share of the network that enters the target network
         self.target_every = target_every  # updates
         self.dtype = torch.bfloat16 if precision == "bf16" else torch.float32
-        if shards > 1 and not splits(network):
-            raise ValueError("a network with batch statistics or dropout does not split a batch into shards")
+        if shards > 1 and not getattr(network, "splits_batches", False):
+            raise ValueError("the network does not say splits_batches, so a batch is not split into shards")
         self.shards = shards
         self._online = _Replicas(network, self.dtype, shards)
         self._target = _Replicas(target, self.dtype, shards)
@@ -311,11 +311,6 @@ class Learner:
             for role, network in (("network", self.network), ("target", self.target))
             for name, generator in _generators(network)
         }
-
-
-def splits(network: nn.Module) -> bool:
-    """Whether what a network makes of a sample depends on that sample alone: no batch statistics, no dropout."""
-    return not any(True for _ in network.buffers()) and not any(True for _ in _generators(network))
 
 
 def _generators(network: nn.Module) -> Iterator[tuple[str, torch.Generator]]:

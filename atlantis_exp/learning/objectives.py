@@ -2,10 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import Annotated, ClassVar, Protocol, TypeAlias
 
 import torch
+from annotated_types import Interval
 from torch.nn.functional import smooth_l1_loss
+
+from atlantis_exp.components import component
 
 QFunction: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
 """States (B, C, H, W) in [0, 1] to float32 values (B, A), or to N quantiles of each (B, A, N), without gradient and in
@@ -35,6 +38,7 @@ def action_values(q: torch.Tensor) -> torch.Tensor:
     return q if q.ndim == 2 else q.mean(2)
 
 
+@component("dqn", "objective")
 @dataclass(frozen=True)
 class DQN:
     """The target network chooses the next action and values it (Mnih et al. 2015; report figure 2.5)."""
@@ -54,6 +58,7 @@ class DQN:
         return smooth_l1_loss(taken(q, a_t), target, reduction="none")
 
 
+@component("double_dqn", "objective")
 @dataclass(frozen=True)
 class DoubleDQN(DQN):
     """The online network chooses the next action, the target network values it (van Hasselt et al. 2016, equation 4).
@@ -69,12 +74,16 @@ class DoubleDQN(DQN):
         return bootstrapped(r_t, discount, taken(target(s_tpm), a_tpm))
 
 
+@component("quantile", "objective")
 @dataclass(frozen=True)
 class Quantile(DQN):
     """QR-DQN: N quantiles of the return, whose mean is the value (Dabney et al. 2018, algorithm 1, kappa 1).
 
     The target network chooses the next action by their mean and gives its quantiles.
     """
+
+    head: ClassVar = "quantile"
+    quantiles: Annotated[int, Interval(ge=1, le=10_000)]
 
     def losses(self, q: torch.Tensor, a_t: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Return the quantile Huber loss of each sample, (B,): a sum over its quantiles, a mean over the target's."""
@@ -86,6 +95,7 @@ class Quantile(DQN):
         return (weight_BNN * smooth_l1_loss(z_BNN, target_BNN, reduction="none")).mean(2).sum(1)
 
 
+@component("double_quantile", "objective")
 @dataclass(frozen=True)
 class DoubleQuantile(Quantile, DoubleDQN):
     """QR-DQN whose online network chooses the next action, as in Double DQN; the target network gives its quantiles."""

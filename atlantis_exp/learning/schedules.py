@@ -2,7 +2,16 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Annotated, Protocol
+
+from annotated_types import Interval
+
+from atlantis_exp.components import component
+
+Probability = Annotated[float, Interval(ge=0, le=1)]
+Positive = Annotated[float, Interval(gt=0)]
+Share = Annotated[float, Interval(gt=0, lt=1)]
+Count = Annotated[int, Interval(ge=1, le=1_000_000_000_000)]
 
 
 class Schedule(Protocol):
@@ -11,41 +20,45 @@ class Schedule(Protocol):
     def __call__(self, progress: float, steps: int) -> float: ...
 
 
+@component("constant", "epsilon", "lr_schedule")
 @dataclass(frozen=True)
 class Constant:
     """The same value throughout."""
 
-    value: float
+    value: Probability
 
     def __call__(self, progress: float, steps: int) -> float:  # noqa: ARG002
         return self.value
 
 
+@component("linear", "epsilon", "lr_schedule")
 @dataclass(frozen=True)
 class Linear:
     """A straight line from `start` to `end` over the first `duration` of the training, then `end`."""
 
-    start: float
-    end: float
-    duration: float  # share of the training
+    start: Probability
+    end: Probability
+    duration: Positive  # share of the training
 
     def __call__(self, progress: float, steps: int) -> float:  # noqa: ARG002
         remaining = max(0.0, 1.0 - progress / self.duration)
         return self.end + (self.start - self.end) * remaining
 
 
+@component("linear_steps", "epsilon")
 @dataclass(frozen=True)
 class LinearSteps:
     """A straight line from `start` to `end` over the first `steps`, then `end`, however long the training is."""
 
-    start: float
-    end: float
-    steps: int
+    start: Probability
+    end: Probability
+    steps: Count
 
     def __call__(self, progress: float, steps: int) -> float:  # noqa: ARG002
         return Linear(self.start, self.end, self.steps)(steps, steps)
 
 
+@component("exponential", "epsilon")
 @dataclass(frozen=True)
 class Exponential:
     """A value whose distance to `end` shrinks by a factor e per `decay` and never quite vanishes (report figure 4.1).
@@ -53,14 +66,15 @@ class Exponential:
     The report decays from 0.9 to 0.02 by episode with half its number of episodes as constant: `decay` 0.5.
     """
 
-    start: float
-    end: float
-    decay: float  # share of the training
+    start: Probability
+    end: Probability
+    decay: Positive  # share of the training
 
     def __call__(self, progress: float, steps: int) -> float:  # noqa: ARG002
         return self.end + (self.start - self.end) * math.exp(-progress / self.decay)
 
 
+@component("one_cycle", "lr_schedule")
 @dataclass(frozen=True)
 class OneCycle:
     """Up from `start` to 1 over the first `rise` of the training and down to `end` over the rest, each half a cosine.
@@ -68,9 +82,9 @@ class OneCycle:
     Smith and Topin 2018, in the form of torch's `OneCycleLR`.
     """
 
-    start: float
-    end: float
-    rise: float  # share of the training
+    start: Probability
+    end: Probability
+    rise: Share  # share of the training
 
     def __call__(self, progress: float, steps: int) -> float:  # noqa: ARG002
         if progress < self.rise:

@@ -3,11 +3,12 @@
 import torch
 from torch import nn
 
+from atlantis_exp.components import component
 from atlantis_exp.networks.heads import Head
 from atlantis_exp.networks.sizes import convolved
-from atlantis_exp.registry import SMALLEST_SIDE
 
 
+@component("cnn", "model")
 class DQNCnn(nn.Module):
     """Three convolutions and two dense layers (report figure 2.1; Mnih et al. 2015).
 
@@ -16,7 +17,8 @@ class DQNCnn(nn.Module):
     `smallest_side`.
     """
 
-    smallest_side = SMALLEST_SIDE["cnn"]  # pixels
+    smallest_side = 36  # pixels: 36 -> 8 -> 3 -> 1
+    splits_batches = True
 
     def __init__(self, input_shape: tuple[int, int, int], num_actions: int, head: Head = nn.Linear) -> None:
         super().__init__()

@@ -3,10 +3,10 @@
 import torch
 from torch import nn
 
+from atlantis_exp.components import component
 from atlantis_exp.networks.dropout import Dropout
 from atlantis_exp.networks.heads import Head
 from atlantis_exp.networks.sizes import convolved
-from atlantis_exp.registry import SMALLEST_SIDE
 
 
 class ResNetBlock(nn.Module):
@@ -40,6 +40,7 @@ class ResNetBlock(nn.Module):
         return y
 
 
+@component("resnet", "model")
 class ResNetDQN(nn.Module):
     """Fourteen convolutions in the main path, four of them the stem, and two dense layers (report figure 2.2).
 
@@ -48,7 +49,7 @@ class ResNetDQN(nn.Module):
     `smallest_side`.
     """
 
-    smallest_side = SMALLEST_SIDE["resnet"]  # pixels
+    smallest_side = 15  # pixels: 15 -> 7 -> 5 -> 3 -> 1
 
     def __init__(self, input_shape: tuple[int, int, int], num_actions: int, head: Head = nn.Linear) -> None:
         super().__init__()

@@ -1,12 +1,16 @@
 """Which transitions to learn from."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
+from annotated_types import Interval
 
+from atlantis_exp.components import component
 from atlantis_exp.replay.memory import ReplayMemory
+
+Probability = Annotated[float, Interval(ge=0, le=1)]
 
 _LEAST_ERROR = 1e-6  # added to every error, so that each transition may come again
 
@@ -45,6 +49,7 @@ class _Stateless:
         pass
 
 
+@component("uniform", "sampler")
 @dataclass(frozen=True)
 class UniformSampler(_Stateless):
     """Every available transition is as likely as any other."""
@@ -54,6 +59,7 @@ class UniformSampler(_Stateless):
         return Draw(memory.draw(batch_size, rng), None)
 
 
+@component("top_half", "sampler")
 @dataclass(frozen=True)
 class TopHalfSampler(_Stateless):
     """Of `oversample` times the batch drawn uniformly, the transitions of highest reward, best first.
@@ -62,7 +68,7 @@ class TopHalfSampler(_Stateless):
     then take only the top half". Of equal rewards the one drawn earlier comes first.
     """
 
-    oversample: int = 2
+    oversample: Annotated[int, Interval(ge=2, le=64)]
 
     def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> Draw:
         """Draw `batch_size` transitions, chosen by the game's rewards alone; ValueError if there are none."""
@@ -70,6 +76,7 @@ class TopHalfSampler(_Stateless):
         return Draw(ids[np.argsort(-memory.rewards(ids), kind="stable")[:batch_size]], None)
 
 
+@component("prioritized", "sampler")
 class PrioritizedSampler:
     """A transition is as likely as its last error to the power `alpha` (Schaul et al. 2016, proportional).
 
@@ -80,7 +87,7 @@ class PrioritizedSampler:
     Beside the memory it takes 16 to 32 bytes for each observation that this may hold.
     """
 
-    def __init__(self, alpha: float, beta: float) -> None:
+    def __init__(self, alpha: Probability, beta: Probability) -> None:
         self.alpha = alpha
         self.beta = beta
         # A binary tree of sums: node n is the sum of 2n and 2n + 1, the leaves are the second half, one a slot of the

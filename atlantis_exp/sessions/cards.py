@@ -13,7 +13,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 from rich.table import Table
 
-from atlantis_exp.build import build_network_actor
+from atlantis_exp.build import build_network_actor, described
 from atlantis_exp.checking import nearest, parse, to_dict
 from atlantis_exp.config import STRICT, Config, EvaluationConfig, PathsConfig
 from atlantis_exp.faults import ConfigError, Fault
@@ -146,6 +146,7 @@ def _page(folder: Path, card: Card, size: int, evaluation: Evaluation) -> str:
         "weights": f"{card.weights}, of step {card.step:,}",
         **{key: f"{value:,.2f}" if value % 1 else f"{value:,.0f}" for key, value in card.reached.items()},
         "seed": card.config.seed,
+        **({"plugins": described(card.config)} if card.config.plugins else {}),
         **card.made,
     }
     place = folder if len(folder.parts) > 1 and not folder.is_absolute() else f"./{folder.name}"

@@ -77,4 +77,5 @@ def _history(run: RunFolder, step: int) -> tuple[dict[str, float], dict[str, str
     made = {key: value for key, value in tags.items() if key == "command" or key.startswith(("git.", "version."))}
     if "command" in made:  # without the places of this machine
         made["command"] = re.sub(r" (paths|tracking)\.\S+", "", made["command"])
+        made["command"] = re.sub(r"/[^,'\]\[]*/(?=\w+\.py\b)", "./", made["command"])  # of plugins
     return reached, made

@@ -9,11 +9,11 @@ from functools import partial
 
 import torch
 
-from atlantis_exp.build import build_trainer, choose_device
+from atlantis_exp.build import build_trainer, choose_device, described, import_components
 from atlantis_exp.checking import flatten, to_dict
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault, RunFault
-from atlantis_exp.runs.folder import CONFIG, LOST, TRACEBACK, Result, RunFolder
+from atlantis_exp.runs.folder import CONFIG, LOST, TRACEBACK, Result, RunFolder, all_runs
 from atlantis_exp.runs.journal import Journal, adopt
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.job import Job, labels
@@ -37,6 +37,7 @@ def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int |
     config, folder = job.config, RunFolder.of(job.config)
     if folder.status != "SCHEDULED":  # where a sweep has, its failure is to be recorded
         choose_device(config.device)  # before anything is put aside or written
+        import_components(config)
     if _has_ended(job, folder):
         return None
     progress = Progress()
@@ -98,7 +99,7 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
     with unforged(folder.checkpoints):
         steps_done = 0 if state is None else int(state["counters"]["steps"])
     if state is None:
-        progress.say(f"starting run {folder.name} in {folder.path}")
+        progress.say(f"starting run {folder.name} in {folder.path}{_changed_plugins(config, folder)}")
     else:
         progress.say(f"continuing run {folder.name} at step {steps_done:,}")
     if config.budget.forecast != "off":
@@ -122,6 +123,21 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
     }
     journal.tags({**provenance(job.command), **facts})
     journal.status("RUNNING")
+
+
+def _changed_plugins(config: Config, folder: RunFolder) -> str:
+    """Which run this one would be, had its plugins not changed since; empty where there is none."""
+    if not config.plugins:
+        return ""
+    science = {**config.science(), "plugins": None}
+    alike = folder.name.rpartition("-")[0]
+    for other in all_runs(folder.path.parents[1]):
+        if other.name.startswith(f"{alike}-") and other.name != folder.name:
+            with suppress(Fault):
+                trained = other.trained_config
+                if {**trained.science(), "plugins": None} == science:
+                    return f"; {described(trained)} of run {other.name} has become {described(config)}: another run"
+    return ""
 
 
 def expected(trainer: Trainer, config: Config, steps_done: int) -> Forecast:

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
-from atlantis_exp.checking import parse
 from atlantis_exp.commands import VERBS
+from atlantis_exp.commands.composing import checked
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.config import Config
 
@@ -84,9 +84,9 @@ def test_showing_the_config_prints_one_that_is_valid_and_leaves_nothing_behind(
     monkeypatch.chdir(tmp_path)
     overrides = ("model=resnet", f"paths.outputs={tmp_path}/o")
     assert command(*overrides, "--cfg", "job", "--resolve") == 0
-    tree = OmegaConf.to_container(OmegaConf.create(capfd.readouterr().out))
-    assert isinstance(tree, dict)
-    shown = parse(Config, {str(key): value for key, value in tree.items()})
+    tree = OmegaConf.create(capfd.readouterr().out)
+    assert isinstance(tree, DictConfig)
+    shown = checked(Config, tree)
     assert [shown] == [*check("config", Config, overrides).values()]
     assert list(tmp_path.iterdir()) == []
 

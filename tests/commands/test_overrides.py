@@ -10,6 +10,7 @@ from atlantis_exp.commands.baseline import BaselineConfig
 from atlantis_exp.commands.compare import CompareConfig
 from atlantis_exp.commands.evaluate import EvaluateConfig
 from atlantis_exp.commands.export import ExportConfig
+from atlantis_exp.commands.new import NewConfig
 from atlantis_exp.commands.overrides import check, refuse_twice
 from atlantis_exp.commands.play import PlayConfig
 from atlantis_exp.commands.query import QueryConfig
@@ -23,6 +24,8 @@ from atlantis_exp.faults import ConfigError
 SCHEMAS: dict[str, type[Any]] = {
     "config": Config,
     "search": SearchConfig,
+    "check": Config,
+    "new": NewConfig,
     "evaluate": EvaluateConfig,
     "export": ExportConfig,
     "baseline": BaselineConfig,
@@ -147,7 +150,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("--config-name=query", "--config-name", "overrides"),
     ("-cn query", "--config-name", "overrides"),
     ("--config-path=/tmp", "--config-path", "overrides"),
-    ("--config-dir=/tmp", "--config-dir", "overrides"),
+    ("--config-dir=/nowhere", "--config-dir=/nowhere", "no such folder"),
     ("--experimental-rerun=x.pickle", "--experimental-rerun", "overrides"),
     ("--info everything", "--info", "defaults"),
     # Hydra's own, which name code and places
@@ -197,6 +200,10 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("export weights=pretrained/fast", "weights=pretrained/fast", "best, latest"),
     ("export too=pretrained/fast", "too=pretrained/fast", "'to'"),
     ("report paths.output=x", "paths.output", "'paths.outputs'"),
+    ("new component.model=mynet", "to", "to=FOLDER"),
+    ("new to=x", "new", "one of model, sampler"),
+    ("new component.model=cnn to=x", "model=cnn", "built in"),
+    ("new component.model=MyNet to=x", "model=MyNet", "small letters"),
     ("ui port=80", "port=80", "greater than or equal to 1024"),
 ]
 

@@ -76,7 +76,7 @@ def test_the_quantile_loss_is_sb3_contrib_s_sum_over_quantiles(quantiles: int) -
     target_BN = torch.from_numpy(rng.normal(0, 2, (9, quantiles)).astype(np.float32))
     actions = torch.arange(9) % 4
     theirs = common.quantile_huber_loss(z_BAN[torch.arange(9), actions], target_BN, sum_over_quantiles=True)
-    ours = Quantile().losses(z_BAN, actions, target_BN).mean()
+    ours = Quantile(quantiles).losses(z_BAN, actions, target_BN).mean()
     torch.testing.assert_close(ours, theirs)
     torch.testing.assert_close(*(torch.autograd.grad(loss, z_BAN)[0] for loss in (ours, theirs)))
 

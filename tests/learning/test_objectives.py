@@ -43,7 +43,7 @@ def test_double_dqn_values_the_online_network_s_best_action_by_the_target_networ
 @every_seed
 def test_the_quantile_targets_are_the_target_network_s_of_its_action_with_the_best_mean(seed: int) -> None:
     rewards, discounts, online, target, _ = _batch(seed, 5)
-    targets = Quantile().targets(rewards, torch.arange(9), discounts, lambda s: online[s], lambda s: target[s])
+    targets = Quantile(5).targets(rewards, torch.arange(9), discounts, lambda s: online[s], lambda s: target[s])
     assert targets.shape == (9, 5)
     for b in range(9):
         best = max(range(4), key=lambda action: sum(target[b, action].tolist()))
@@ -55,7 +55,7 @@ def test_the_quantile_targets_are_the_target_network_s_of_its_action_with_the_be
 @every_seed
 def test_double_quantile_targets_are_the_target_network_s_of_the_online_network_s_best_mean(seed: int) -> None:
     rewards, discounts, online, target, now = _batch(seed, 5)
-    targets = DoubleQuantile().targets(rewards, torch.arange(9), discounts, lambda s: online[s], lambda s: target[s])
+    targets = DoubleQuantile(5).targets(rewards, torch.arange(9), discounts, lambda s: online[s], lambda s: target[s])
     for b in range(9):
         best = max(range(4), key=lambda action: sum(online[b, action].tolist()))
         for j in range(5):
@@ -63,13 +63,13 @@ def test_double_quantile_targets_are_the_target_network_s_of_the_online_network_
             assert targets[b, j].item() == pytest.approx(expected, rel=1e-5, abs=1e-5)
     actions = torch.arange(9) % 4
     torch.testing.assert_close(
-        DoubleQuantile().losses(now, actions, targets), Quantile().losses(now, actions, targets), rtol=0, atol=0
+        DoubleQuantile(5).losses(now, actions, targets), Quantile(5).losses(now, actions, targets), rtol=0, atol=0
     )
 
 
 @pytest.mark.parametrize(
     ("objective", "shape"),
-    [(DQN(), (2, 4)), (DoubleDQN(), (2, 4)), (Quantile(), (2, 4, 3)), (DoubleQuantile(), (2, 4, 3))],
+    [(DQN(), (2, 4)), (DoubleDQN(), (2, 4)), (Quantile(5), (2, 4, 3)), (DoubleQuantile(5), (2, 4, 3))],
     ids=str,
 )
 def test_nothing_comes_through_a_cut_bootstrap(objective: DQN | Quantile, shape: tuple[int, ...]) -> None:
@@ -97,7 +97,7 @@ def test_the_quantile_loss_is_the_paper_s_sum_written_out(seed: int) -> None:
     _, _, _, target, z_BAN = _batch(seed, quantiles)
     actions = torch.from_numpy(np.random.default_rng(seed).integers(0, 4, 9))
     target_BN = target[:, 0]
-    losses = Quantile().losses(z_BAN, actions, target_BN)
+    losses = Quantile(5).losses(z_BAN, actions, target_BN)
     assert losses.shape == (9,)
     for b in range(9):
         expected = 0.0
@@ -119,7 +119,7 @@ def test_the_quantile_loss_is_least_at_the_quantiles() -> None:
     for step in range(3_000):
         optimizer.param_groups[0]["lr"] = 1.0 if step < 2_000 else 0.05
         target_1N = torch.from_numpy(rng.uniform(0, 100, (64, 4)).astype(np.float32))
-        loss = Quantile().losses(z_11N.expand(64, 1, 4), torch.zeros(64, dtype=torch.int64), target_1N).mean()
+        loss = Quantile(5).losses(z_11N.expand(64, 1, 4), torch.zeros(64, dtype=torch.int64), target_1N).mean()
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()

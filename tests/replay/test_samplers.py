@@ -46,12 +46,12 @@ def test_top_half_doubles_the_share_of_rare_rewards() -> None:
     memory = memory_with_rewards(rewards)
     uniform, top_half = (
         np.count_nonzero(memory.rewards(sampler.sample(memory, 10_000, np.random.default_rng(1)).ids))
-        for sampler in (UniformSampler(), TopHalfSampler())
+        for sampler in (UniformSampler(), TopHalfSampler(2))
     )
     assert 1.8 < top_half / uniform < 2.2
 
 
-@pytest.mark.parametrize(("sampler", "drawn"), [(UniformSampler(), 8), (TopHalfSampler(), 16)])
+@pytest.mark.parametrize(("sampler", "drawn"), [(UniformSampler(), 8), (TopHalfSampler(2), 16)])
 def test_a_sampler_chooses_before_any_frame_is_decoded(
     sampler: Sampler, drawn: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

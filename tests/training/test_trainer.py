@@ -33,7 +33,7 @@ TWO_PHASES = (
 )
 
 
-PHASES = [Phase("quick", 80, 1e-3, UniformSampler()), Phase("second", 60, 3e-4, TopHalfSampler())]
+PHASES = [Phase("quick", 80, 1e-3, UniformSampler()), Phase("second", 60, 3e-4, TopHalfSampler(2))]
 
 
 def phases(length: int, sampler: Sampler | None = None) -> list[Phase]:

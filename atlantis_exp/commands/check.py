@@ -1,0 +1,29 @@
+"""`python -m atlantis_exp check model=mynet plugins=./mynet.py`: does a component keep what the rest relies on?"""
+
+from collections.abc import Callable
+from functools import partial
+
+from atlantis_exp.commands.app import Asked, Verb
+from atlantis_exp.commands.jobs import job_of, training_of
+from atlantis_exp.config import Config
+from atlantis_exp.sessions.job import replaced
+
+_SMALL = (  # a training of seconds
+    *("phase=quick", "phase.quick.steps=600", "env.num_envs=1", "env.max_steps=50", "budget.forecast=off"),
+    *("training.learn_start=20", "training.learn_every=8", "training.batch_size=4", "replay.capacity=200"),
+    *("training.precision=fp32", "threads=1", "evaluation.at_end=false", "evaluation.every_episodes=null"),
+    *("evaluation.every_steps=null", "tracking=none", "tracking.commit_episodes=2"),
+)
+
+
+def _work(asked: Asked[Config]) -> Callable[[], None]:
+    from atlantis_exp.sessions.contracts import check
+
+    chosen = [text for text in asked.overrides if not text.startswith("phase")]
+    beside = [f"model={name}" for name in ("cnn", "resnet")]
+    own = [text for text in asked.overrides if not text.startswith("model")]
+    others = [training_of([*own, text]) for text in beside if text not in asked.overrides]
+    return partial(check, job_of(asked), training_of(replaced(chosen, *_SMALL)), others)
+
+
+VERB = Verb("check", Config, _work)

@@ -1,0 +1,55 @@
+"""`python -m atlantis_exp new model=mynet to=FOLDER`: a package with a component of one's own, to begin with."""
+
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from atlantis_exp.commands.app import Asked, Verb
+from atlantis_exp.components import KINDS, NAME, built_in
+from atlantis_exp.config import STRICT
+from atlantis_exp.faults import ConfigError
+
+
+@dataclass(config=STRICT, kw_only=True, frozen=True)
+class NewConfig:
+    """A component's kind and name, and where its package is to be."""
+
+    component: dict[str, str | None]  # by kind
+    to: Annotated[str, Field(min_length=1)] | None
+
+    def __post_init__(self) -> None:
+        if len(self.named) != 1:
+            raise ConfigError(f"new: name one component, as one of {', '.join(KINDS)}: model=mynet")
+        ((kind, name),) = self.named.items()
+        if not re.fullmatch(NAME, name):
+            raise ConfigError(f"{kind}={name}: a name is of small letters, digits and underscores, as in {kind}=mynet")
+        if (kind, name) in built_in():
+            raise ConfigError(f"{kind}={name}: is built in and is not replaced; give yours another name")
+        if self.to is None:
+            raise ConfigError(f"to: missing; write to=FOLDER, as in to=./{name}")
+
+    @property
+    def named(self) -> dict[str, str]:
+        """The names by kind."""
+        return {kind: name for kind, name in self.component.items() if name is not None}
+
+
+def _spell_out(arguments: list[str]) -> list[str]:
+    """Let `model=` on the command line be the component's."""
+    # Hydra itself would take `model` for the config group of that name.
+    return [re.sub(rf"^({'|'.join(KINDS)})=", r"component.\1=", argument) for argument in arguments]
+
+
+def _work(asked: Asked[NewConfig]) -> Callable[[], None]:
+    from atlantis_exp.sessions.beginning import begin
+
+    ((kind, name),) = asked.config.named.items()
+    return partial(begin, kind, name, Path(asked.config.to or "").expanduser())
+
+
+VERB = Verb("new", NewConfig, _work, rewrite=_spell_out)

@@ -1,0 +1,49 @@
+"""What `new` writes works as it is."""
+
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from atlantis_exp.commands.overrides import check
+from atlantis_exp.components import ENTRY_POINTS, KINDS, admit
+from atlantis_exp.config import Config
+from atlantis_exp.sessions.contracts import trials
+from atlantis_exp.sessions.job import Job
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_admitted_afterwards() -> Iterator[None]:
+    yield
+    admit([])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_written_keeps_every_contract(
+    kind: str,
+    command: Callable[..., int],
+    tiny_overrides: tuple[str, ...],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = tmp_path / "new"
+    assert command("new", f"{kind}=my_own", f"to={folder}") == 0
+    source = folder / "atlantis_my_own" / "my_own.py"
+    assert f"check {kind}=my_own plugins={source}" in capsys.readouterr().out
+    project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+    assert project["entry-points"][ENTRY_POINTS] == {"my_own": "atlantis_my_own.my_own"}
+    for path in folder.rglob("*.py"):
+        compile(path.read_text(), path, "exec")
+
+    yaml = folder / "atlantis_my_own" / "conf" / kind / "my_own.yaml"
+    first, *_ = yaml.read_text().splitlines()
+    words = [*tiny_overrides, f"{kind}=my_own", f"plugins={source}"]
+    ((_, config),) = check("config", Config, words).items()
+    assert getattr(config, kind).settings[first.split(":")[0]] == float(first.split(":")[1])
+    for _, contract, trial in trials(config, Job(config)):
+        if not contract.startswith("killed"):
+            trial()
+
+    assert command("new", f"{kind}=my_own", f"to={folder}") == 2
+    assert "is not empty" in capsys.readouterr().err

@@ -1,0 +1,139 @@
+"""A component that breaks a promise is found out, and the promise named."""
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from atlantis_exp.commands.overrides import check
+from atlantis_exp.components import admit
+from atlantis_exp.config import Config
+from atlantis_exp.sessions.contracts import trials
+from atlantis_exp.sessions.job import Job, replaced
+
+Command = Callable[..., int]
+
+PARTS = """
+import random
+
+import numpy as np
+import torch
+from torch import nn
+
+from atlantis_exp.components import component
+from atlantis_exp.learning.objectives import DQN, bootstrapped
+from atlantis_exp.replay.samplers import Draw
+
+
+@component("mine", "model")
+class Mine(nn.Module):
+    splits_batches = True
+
+    def __init__(self, input_shape, num_actions, head):
+        super().__init__()
+        channels, *_ = input_shape
+        self.layers = nn.Sequential(nn.AdaptiveAvgPool2d(4), nn.Flatten(), nn.Linear(16 * channels, 16), nn.ReLU())
+        self.head = head(16, num_actions)
+
+    def forward(self, x):
+        return self.head(self.layers(x))
+
+
+@component("mine", "objective")
+class Same(DQN):
+    pass
+
+
+@component("mine", "sampler")
+class Every:
+    drawn = 0
+
+    def sample(self, memory, batch_size, rng):
+        self.drawn += 1
+        return Draw(np.sort(memory.draw(batch_size + self.drawn, rng))[:batch_size], None)
+
+    def feed_back(self, ids, errors):
+        pass
+
+    def state_dict(self):
+        return {"drawn": self.drawn}
+
+    def load_state_dict(self, state):
+        self.drawn = state["drawn"]
+
+
+@component("mine", "epsilon", "lr_schedule")
+class Half:
+    def __call__(self, progress, steps):
+        return 0.5
+"""
+CHOSEN = ("model=mine", "objective=mine", "sampler=mine", "epsilon=mine", "lr_schedule=mine")
+BREACHES = [  # what a part is replaced by, and the contracts that it breaks
+    ("", "", ()),
+    ("nn.ReLU())", "nn.Dropout(0.5))", ("draws from no global stream", "a batch in parts is the batch")),
+    ("nn.Flatten(),", "nn.BatchNorm2d(4), nn.Flatten(),", ("a batch in parts is the batch",)),
+    ("head(16, num_actions)", "nn.Linear(16, num_actions)", ("learns: quantile",)),
+    ("head(16, num_actions)", "head(16, num_actions + 1)", ("learns: plain",)),
+    ("self.layers(x)", "self.layers(x.double())", ("learns: plain, 84 pixels, fp32",)),
+    ("self.layers = ", "self.level = float(torch.ones(1).sum()); self.layers = ", ("weights there and back, on meta",)),
+    ("self.head(self", "random.random() * self.head(self", ("draws from no global stream",)),
+    (
+        "(DQN):\n    pass",
+        "(DQN):\n    def losses(self, *given):\n        return super().losses(*given).mean()",
+        ("targets and",),
+    ),
+    (
+        *(
+            "(DQN):\n    pass",
+            "(DQN):\n    def targets(self, r, s, d, online, target):\n        return r + target(s).mean(1)",
+        ),
+        ("discount 0",),
+    ),
+    ('{"drawn": self.drawn}', '{"drawn": 0}', ("state there and back",)),
+    ("[:batch_size], None", ", None", ("a batch of what there is",)),
+    ("return 0.5", "return 1.5 - progress", ("in [0, 1]",)),
+    ("return 0.5", "return 0.5 - progress", ("in [0, 1]", "finite, not negative")),
+]
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_admitted_afterwards() -> Iterator[None]:
+    yield
+    admit([])
+
+
+@pytest.mark.parametrize(("part", "instead", "contracts"), BREACHES, ids=[instead for _, instead, _ in BREACHES])
+def test_a_breach_is_named(
+    part: str, instead: str, contracts: tuple[str, ...], tmp_path: Path, tiny_overrides: tuple[str, ...]
+) -> None:
+    assert part in PARTS
+    (tmp_path / "mine.py").write_text(PARTS.replace(part, instead, 1))
+    ((_, config),) = check("config", Config, [*tiny_overrides, f"plugins={tmp_path / 'mine.py'}", *CHOSEN]).items()
+    broken = set()
+    for _, contract, trial in trials(config, Job(config)):
+        if not contract.startswith("killed"):  # which takes processes
+            try:
+                trial()
+            except Exception:
+                broken.add(contract)
+    for wanted in contracts:
+        assert any(contract.startswith(wanted) for contract in broken), broken
+    assert bool(broken) == bool(contracts)
+
+
+@pytest.mark.slow
+def test_the_table_says_what_is_kept_and_what_it_costs(
+    command: Command, tiny_overrides: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.py").write_text(PARTS)
+    words = [*tiny_overrides, f"plugins={tmp_path / 'mine.py'}", *CHOSEN, f"paths.outputs={tmp_path / 'outputs'}"]
+    assert command("check", *words) == 0
+    shown = capsys.readouterr().out
+    assert "BROKEN" not in shown
+    assert re.search(r"killed and continued is unbroken, bit for bit +│ kept", shown)
+    assert [re.search(rf"│ {name} +│ +40 │ +[\d,]+ │", shown) is not None for name in ("mine", "cnn", "resnet")]
+    assert not (tmp_path / "outputs").exists()
+    (tmp_path / "mine.py").write_text(PARTS.replace("return 0.5", "return 7"))
+    assert command("check", *replaced(words, "model=cnn")) == 1
+    assert "broken: epsilon=mine: in [0, 1]" in capsys.readouterr().err
