@@ -217,6 +217,7 @@ def test_a_sweep_side_by_side_finds_plugins_and_options_of_one_s_own(
     assert sorted(run.config["model"].get("width", 0) for run in runs) == [0, 8, 32]
 
 
+@pytest.mark.slow
 def test_a_run_is_evaluated_exported_played_and_compared(
     plugins: Path, command: Command, tiny_overrides: tuple[str, ...], said: Said, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -336,6 +337,7 @@ BROKEN = [  # what is in mynet.py instead of a part of it, the line that is to b
 ]
 
 
+@pytest.mark.thinned(3)
 @pytest.mark.parametrize(
     ("part", "instead", "blamed", "reason"), BROKEN, ids=[f"{each[1]} {each[3]}" for each in BROKEN]
 )

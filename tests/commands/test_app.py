@@ -62,7 +62,7 @@ def test_a_process_ends_as_its_command_line_does(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "verb",
     [
-        pytest.param(verb, marks=() if verb in ("", "train", "compare", "verify-resume") else pytest.mark.slow)
+        pytest.param(verb, marks=() if verb in ("", "compare") else pytest.mark.slow)
         for verb in ("", *VERBS)
     ],
 )

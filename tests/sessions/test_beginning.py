@@ -19,6 +19,7 @@ def _nothing_is_admitted_afterwards() -> Iterator[None]:
     admit([])
 
 
+@pytest.mark.thinned(len(KINDS))
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_written_keeps_every_contract(
     kind: str,

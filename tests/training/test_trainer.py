@@ -335,7 +335,7 @@ def test_a_truncated_episode_bootstraps_and_a_terminated_one_does_not(
 def test_a_plan_in_episodes_ends_with_its_last_episode(small: Small, tmp_path: Path) -> None:
     trainer = small(tmp_path, unit="episodes", phases=phases(3), **NEVER)
     epsilons = []
-    while trainer.run(after(1)) == "interrupted":
+    while trainer.run(after(7)) == "interrupted":
         epsilons.append((trainer.counters.episodes, trainer.plan.epsilon_at(trainer.counters)))
     assert (trainer.counters.episodes, trainer.counters.steps) == (3, 120)
     assert dict(epsilons) == {done: trainer.plan.epsilon((done + 1) / 3, 0) for done in range(3)}
