@@ -61,10 +61,7 @@ def test_a_process_ends_as_its_command_line_does(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "verb",
-    [
-        pytest.param(verb, marks=() if verb in ("", "compare") else pytest.mark.slow)
-        for verb in ("", *VERBS)
-    ],
+    [pytest.param(verb, marks=() if verb in ("", "compare") else pytest.mark.slow) for verb in ("", *VERBS)],
 )
 def test_help_says_what_the_verb_does_and_which_verbs_there_are(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], verb: str
