@@ -17,15 +17,16 @@ from torch import nn
 
 from atlantis_exp import config as cfg
 from atlantis_exp.checking import to_dict
-from atlantis_exp.components import admitted, describe
+from atlantis_exp.components import Component, Method, admitted, describe, facts_of
 from atlantis_exp.faults import ConfigError, Fault
-from atlantis_exp.game.emulator import ACTIONS, Emulator
+from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.preprocessing import FrameStack, Preprocessing
 from atlantis_exp.game.vector import Emulators, make_emulators
 from atlantis_exp.learning.allocation import keep_freed_memory
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.networks.dropout import seed_dropout
 from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
+from atlantis_exp.registry import Game
 from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.runs.folder import CHECKPOINTS
 from atlantis_exp.runs.journal import Tracker
@@ -51,10 +52,23 @@ def stream(seed: int, name: str) -> np.random.SeedSequence:
     return np.random.SeedSequence(seed, spawn_key=(zlib.crc32(name.encode()),))
 
 
+def build_game(component: Component) -> Game:
+    """What a game says of itself, with its code where it has parts of a score."""
+    game = facts_of(component)
+    if not game.sources:
+        return game
+    # What a plugin's file defines, a worker process cannot import.
+    points = component.load().points if component.plugin is None else Method(component, "points")
+    return dataclasses.replace(game, points=points)
+
+
 def make_emulator(env: cfg.EnvConfig) -> partial[Emulator]:
-    """What makes one emulator, here or in a worker process."""
+    """What makes one emulator, here or in a worker process. Raises: ConfigError."""
+    if (component := env.game) is None:
+        raise ConfigError(f"env.id={env.id}: its game is a plugin's; name it with plugins=")
     return partial(
         Emulator,
+        game=build_game(component),
         preprocessing=Preprocessing(env.size, env.crop),
         frameskip=env.frameskip,
         sticky=env.sticky,
@@ -131,6 +145,7 @@ def import_components(config: cfg.Config) -> None:
         if part.component is None:
             raise ConfigError(needs(config))
         part.component.load()
+    _num_actions(config)
 
 
 def _check_output(config: cfg.Config, network: nn.Module) -> None:
@@ -138,13 +153,20 @@ def _check_output(config: cfg.Config, network: nn.Module) -> None:
     component, env = config.model.component, config.env
     if component is None or component.plugin is None:
         return
-    shape: tuple[int, ...] = (2, len(ACTIONS))
+    shape: tuple[int, ...] = (2, _num_actions(config))
     if config.model.head == "quantile":
         shape = (*shape, config.objective.settings["quantiles"])
     with component.blamed(), torch.no_grad():
         made = tuple(network.eval()(torch.zeros(2, env.stack, env.size, env.size)).shape)
         if made != shape:
             raise TypeError(f"{component.class_name} returns {made} for two states; it should be {shape}, the head's")
+
+
+def _num_actions(config: cfg.Config) -> int:
+    """How many actions a config's game has. Raises: ConfigError where it is a plugin's that is not there."""
+    if config.game is None:
+        raise ConfigError(needs(config))
+    return len(facts_of(config.game).actions)
 
 
 def needs(config: cfg.Config) -> str:
@@ -178,7 +200,8 @@ def _architecture(config: cfg.Config) -> nn.Module:
         raise ConfigError(needs(config))
     if config.model.head == "quantile":
         head = partial(QuantileHead, quantiles=objective.settings["quantiles"])
-    network: nn.Module = build_component(config, config.model, (env.stack, env.size, env.size), len(ACTIONS), head)
+    shape = env.stack, env.size, env.size
+    network: nn.Module = build_component(config, config.model, shape, _num_actions(config), head)
     return network
 
 
@@ -266,7 +289,7 @@ def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Acto
         raise
     except (SafetensorError, RuntimeError) as error:
         raise Fault(f"the weights are damaged or another network's: {' '.join(str(error).split())}") from error
-    return EpsilonGreedy(learner.q_values, len(ACTIONS), watches=True)
+    return EpsilonGreedy(learner.q_values, _num_actions(config), watches=True)
 
 
 def build_person(env: cfg.EnvConfig, choose: Callable[[npt.NDArray[np.uint8]], int]) -> tuple[PersonActor, Emulators]:
@@ -275,9 +298,9 @@ def build_person(env: cfg.EnvConfig, choose: Callable[[npt.NDArray[np.uint8]], i
     return PersonActor(emulator.screen_rgb, choose), make_emulators(lambda: emulator, 1, 1)
 
 
-def build_baseline(agent: cfg.BaselineAgentConfig) -> Actor:
-    """A player without a network."""
-    return RandomActor(len(ACTIONS)) if agent.name == "random" else ConstantActor(agent.action)
+def build_baseline(agent: cfg.BaselineAgentConfig, env: cfg.EnvConfig) -> Actor:
+    """A player of a game without a network."""
+    return RandomActor(len(facts_of(env.game).actions)) if agent.name == "random" else ConstantActor(agent.action)
 
 
 def build_evaluator(env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig) -> Evaluator:
@@ -319,13 +342,14 @@ def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: 
     """All of a run; it writes under `folder` only. `about` opens its description, in markdown."""
     env = config.env
     plan, learner, memory = build_plan(config), build_learner(config), build_memory(config)
-    watched = EpsilonGreedy(learner.evaluated_q_values, len(ACTIONS), watches=True)
+    num_actions = _num_actions(config)
+    watched = EpsilonGreedy(learner.evaluated_q_values, num_actions, watches=True)
     evaluator = build_evaluator(env, config.evaluation)
     return Trainer(
         plan=plan,
         emulators=build_emulators(env, env.num_envs),
         stack=FrameStack(env.num_envs, env.size, env.stack),
-        actor=EpsilonGreedy(learner.q_values, len(ACTIONS)),
+        actor=EpsilonGreedy(learner.q_values, num_actions),
         memory=memory,
         learner=learner,
         exploration=[np.random.default_rng(child) for child in stream(config.seed, "exploration").spawn(env.num_envs)],
@@ -340,6 +364,7 @@ def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: 
             progress=progress,
             evaluate=partial(evaluator, watched),
             film=evaluator.film,
+            score_range=facts_of(config.game).score_range,
             about=about,
         ),
         checkpoints=Checkpoints(folder / CHECKPOINTS, config.identity()),

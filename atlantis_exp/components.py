@@ -9,23 +9,23 @@ import hashlib
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING, dataclass, fields
 from functools import cache
 from importlib import import_module
 from importlib.metadata import Distribution, PackageNotFoundError, distribution, distributions
 from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal
 
 from annotated_types import Interval
 
 from atlantis_exp.checking import nearest
 from atlantis_exp.faults import ConfigError, Fault
-
-C = TypeVar("C", bound=type)
+from atlantis_exp.registry import Game
+from atlantis_exp.registry import component as component
 
 ENTRY_POINTS: Final = "atlantis_exp.plugins"
 """The group of the entry points by which an installed distribution names its modules with components."""
@@ -33,7 +33,7 @@ NAME: Final = r"^[a-z][a-z0-9_]{0,39}$"
 """What a component and a setting may be called: run folders and config keys are made of it."""
 
 _OURS = Path(__file__).resolve().parent
-_PLACES = ("networks/*.py", "replay/samplers.py", "learning/objectives.py", "learning/schedules.py")
+_PLACES = ("networks/*.py", "replay/samplers.py", "learning/objectives.py", "learning/schedules.py", "game/*.py")
 _MOST_BYTES = 1_000_000  # of a source
 _MOST_FILES = 10_000  # of a package
 _PLAIN = {"int": int, "float": float, "bool": bool, "str": str}
@@ -60,6 +60,7 @@ KINDS: Final = {
     "objective": Kind(facts={"head": "plain"}),  # that a network needs: plain, which dueling is too, or quantile
     "epsilon": Kind(),
     "lr_schedule": Kind(),
+    "env": Kind(facts={each.name: each.default for each in fields(Game) if each.name not in ("rom", "points")}),
 }
 """The kinds of components, which are config groups, too."""
 
@@ -109,6 +110,10 @@ class Component:
             loaded: type[Any] = getattr(self.source.load(), self.class_name)
         return loaded
 
+    def beside(self, name: str) -> Path:
+        """The path of a file that comes with it: of `atlantis` and `scores.csv`, `atlantis_scores.csv` next to it."""
+        return self.source.path.with_name(f"{self.name}_{name}")
+
     @contextmanager
     def blamed(self) -> Iterator[None]:
         """Turn what a plugin's code raises into one line that names its file and line. Raises: ConfigError."""
@@ -126,6 +131,17 @@ class Component:
             ]
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise ConfigError(f"{self.source.path}:{lines[-1] if lines else self.line}: {reason}") from error
+
+
+@dataclass(frozen=True)
+class Method:
+    """A static method of a plugin's class that other processes can be sent: they load its source anew."""
+
+    component: Component
+    name: str
+
+    def __call__(self, *given: Any) -> Any:
+        return getattr(self.component.load(), self.name)(*given)
 
 
 @dataclass(frozen=True)
@@ -168,11 +184,6 @@ class Source:
             reason = getattr(error, "msg", None) or str(error) or type(error).__name__
             raise ConfigError(f"{self.path}:{line}: {type(error).__name__}: {reason}") from None
         return [*_Reader(self, tree).components()]
-
-
-def component(name: str, *kinds: str) -> Callable[[C], C]:  # noqa: ARG001 - whoever reads the source reads them there
-    """Name a class as a component of these kinds, all of them plain strings: `@component("mynet", "model")`."""
-    return lambda named: named
 
 
 def describe(name: str, version: str | None, sha256: str) -> str:
@@ -247,6 +258,27 @@ def admitted() -> Mapping[tuple[str, str], Component]:
 def known(kind: str) -> dict[str, Component]:
     """The components of a kind by name, ours and the admitted plugins'."""
     return {name: found for (of, name), found in {**built_in(), **admitted()}.items() if of == kind}
+
+
+def game_ids(name: str) -> tuple[str, str]:
+    """Gymnasium's two ids of a game: of `atlantis`, Atlantis-v0 and ALE/Atlantis-v5."""
+    title = name.title().replace("_", "")
+    return f"{title}-v0", f"ALE/{title}-v5"
+
+
+def game_of(env_id: str) -> Component | None:
+    """The game that one of Gymnasium's ids names; None where it is a plugin's that no command line names."""
+    return next((game for name, game in known("env").items() if env_id in game_ids(name)), None)
+
+
+def title_of(env_id: str) -> str:
+    """What people call the game of one of Gymnasium's ids: of ALE/Atlantis-v5, Atlantis."""
+    return env_id.rpartition("/")[2].partition("-v")[0]
+
+
+def facts_of(game: Component | None) -> Game:
+    """What a game says of itself, without its code; of one that is not known, nothing."""
+    return Game() if game is None else Game(rom=game.name, **game.facts)
 
 
 def installed() -> dict[str, list[Component]]:
@@ -357,7 +389,16 @@ class _Reader:
                         facts = self._facts(node, KINDS[kind].facts or {})
                         if facts.get("head") == "quantile" and "quantiles" not in {each.name for each in settings}:
                             raise self._error(node, 'head = "quantile" needs a setting quantiles, their number')
+                        if kind == "env":
+                            self._check_game(node, settings, facts)
                         yield Component(kind, name, node.name, settings, facts, self._source, node.lineno)
+
+    def _check_game(self, node: ast.ClassDef, settings: Sequence[Setting], facts: Mapping[str, Any]) -> None:
+        if settings:
+            raise self._error(node, f"{settings[0].name}: a game has no settings; they are those of conf/env")
+        for fact, example in (("actions", '("NOOP", "FIRE")'), ("score_range", "(0.0, 400.0)")):
+            if facts[fact] == KINDS["env"].facts[fact]:  # type: ignore[index]
+                raise self._error(node, f"{fact}: missing; write {fact} = {example}")
 
     def _names(self, call: ast.Call) -> list[str]:
         names = [argument.value if isinstance(argument, ast.Constant) else None for argument in call.args]

@@ -13,12 +13,12 @@ from functools import cache
 from keyword import iskeyword
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import ConfigDict, Field, PlainValidator, TypeAdapter, ValidationInfo
+from pydantic import AfterValidator, ConfigDict, Field, PlainValidator, TypeAdapter, ValidationInfo
 from pydantic.dataclasses import dataclass
 from pydantic_core import PydanticKnownError
 
 from atlantis_exp.checking import check_server, digest, nearest, seconds, to_dict
-from atlantis_exp.components import KINDS, NAME, Component, Plugin, known
+from atlantis_exp.components import KINDS, NAME, Component, Plugin, game_ids, game_of, known, title_of
 from atlantis_exp.faults import ConfigError
 
 STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
@@ -44,9 +44,9 @@ SCREEN = (210, 160)  # rows, columns of the emulator's screen
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class EnvConfig:
-    """One Atlantis and how its screen becomes an observation (report figure 2.3)."""
+    """One game and how its screen becomes an observation (report figure 2.3)."""
 
-    id: Literal["Atlantis-v0", "ALE/Atlantis-v5"]
+    id: Annotated[str, Field(max_length=100)]  # Gymnasium's, which names the game
     frameskip: Frameskip | tuple[Frameskip, Frameskip]  # frames a step; a pair is drawn from [low, high)
     sticky: Probability
     max_frames: Annotated[int, Field(ge=1, lt=2**31)]  # frames an episode
@@ -75,6 +75,28 @@ class EnvConfig:
             raise ConfigError(
                 "env.max_pool=true: needs one fixed env.frameskip of at least 2, as in env=atlantis_standard"
             )
+
+    @property
+    def game(self) -> Component | None:
+        """The game that the id names; None where it is a plugin's that no command line names."""
+        return game_of(self.id)
+
+    @property
+    def title(self) -> str:
+        """What people call the game."""
+        return title_of(self.id)
+
+
+def _check_game(env: EnvConfig, info: ValidationInfo) -> EnvConfig:
+    """Raise ConfigError where the id names no game that is known here, nor may be one of a run's plugins."""
+    if env.game is None and not (info.data.get("plugins") and re.fullmatch(r"(ALE/)?[A-Z][A-Za-z0-9]*-v\d", env.id)):
+        ids = [each for name in known("env") for each in game_ids(name)]
+        raise ConfigError(f"env.id={env.id}: no such choice; {nearest(env.id, ids)}")
+    return env
+
+
+Env = Annotated[EnvConfig, AfterValidator(_check_game)]
+"""An environment whose game is known, or a plugin's that the run was trained with."""
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -243,7 +265,9 @@ def record_plugins(tree: dict[str, Any]) -> None:
     """Write into a composed config which of the admitted plugins its components are of."""
     samplers = tree["samplers"] if isinstance(tree.get("samplers"), dict) else {}
     named = [(kind, tree.get(kind)) for kind in KINDS] + [("sampler", each) for each in samplers.values()]
-    found = (known(kind).get(str(part.get("name"))) for kind, part in named if isinstance(part, dict))
+    found = [known(kind).get(str(part.get("name"))) for kind, part in named if isinstance(part, dict)]
+    if isinstance(env := tree.get("env"), dict):
+        found.append(game_of(str(env.get("id"))))
     plugins = {each.plugin.name: each.plugin for each in found if each is not None and each.plugin is not None}
     tree["plugins"] = {
         name: {"version": plugin.version, "sha256": plugin.sha256} for name, plugin in sorted(plugins.items())
@@ -342,7 +366,7 @@ class BaselineAgentConfig:
     """A player without a network."""
 
     name: Literal["random", "constant"]
-    action: Annotated[int, Field(ge=0, le=3)]  # of the constant player
+    action: Annotated[int, Field(ge=0, le=17)]  # of the constant player, by its place among the game's
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -357,7 +381,7 @@ class Config:
     compile: bool = False  # as in runs and cards from before there was the key
     training: TrainingConfig
     replay: ReplayConfig
-    env: EnvConfig
+    env: Env
     model: Annotated[ModelConfig, _component("model")]
     objective: Annotated[ObjectiveConfig, _component("objective")]
     optimizer: OptimizerConfig
@@ -406,6 +430,12 @@ class Config:
                 )
         if len({phase.steps is None for phase in self.phase.values()}) > 1:
             raise ConfigError("phase: all phases must have their length in the same unit, episodes or steps")
+
+    @property
+    def game(self) -> Component | None:
+        """The game; None where it is a plugin's that no command line names, or that is not what it was."""
+        game = self.env.game
+        return game if game is None or game.plugin is None or _is_recorded(game.plugin, self.plugins) else None
 
     def sampler_of(self, phase: str) -> SamplerConfig:
         """The sampler that a phase names; the chosen one takes precedence over a library one of the same name."""

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SCORE_RANGE = (1e3, 1e6)  # the axis of every histogram, so that runs and steps can be laid side by side
 BINS = 30  # as in report figure 3.1
 COLUMNS = 40  # of a heat map: windows of the training
 BLACK, BLUE, ORANGE, GREEN, VERMILLION, GREY = "#000000", "#0072B2", "#E69F00", "#009E73", "#D55E00", "#999999"
@@ -23,18 +22,19 @@ PURPLE, SKY = "#CC79A7", "#56B4E9"
 """Colours that people with any colour vision tell apart (Okabe and Ito, 2008)."""
 
 
-def score_histogram(scores: Sequence[float], title: str) -> bytes:
-    """A PNG, 256 x 256, of a score distribution on fixed axes; scores beyond them stand at their ends.
+def score_histogram(scores: Sequence[float], title: str, axis: tuple[float, float]) -> bytes:
+    """A PNG, 256 x 256, of a score distribution; scores beyond the axis stand at its ends.
+
+    axis: where it begins and ends, the same for all pictures of a game, so that runs and steps can be laid side by
+        side; logarithmic where it begins above 0.
 
     The axis of the shares has the root for a scale: distributions over many bins and over one are both read on it.
     """
     figure, axes = _square()
-    axes.hist(
-        np.clip(scores, *SCORE_RANGE), _edges().tolist(), weights=np.full(len(scores), 1 / len(scores)), color=BLUE
-    )
-    axes.axvline(float(np.clip(np.mean(scores), *SCORE_RANGE)), color=VERMILLION, linewidth=1.5)
-    axes.set_xscale("log")
-    axes.set_xlim(*SCORE_RANGE)
+    axes.hist(np.clip(scores, *axis), _edges(axis).tolist(), weights=np.full(len(scores), 1 / len(scores)), color=BLUE)
+    axes.axvline(float(np.clip(np.mean(scores), *axis)), color=VERMILLION, linewidth=1.5)
+    axes.set_xscale(_scale(axis))
+    axes.set_xlim(*axis)
     axes.set_yscale("function", functions=(np.sqrt, np.square))
     axes.set_ylim(0, 1)
     axes.set_yticks([0, 0.05, 0.25, 0.5, 1], ["0", "5 %", "25 %", "50 %", "100 %"])
@@ -43,20 +43,23 @@ def score_histogram(scores: Sequence[float], title: str) -> bytes:
     return _png(figure)
 
 
-def score_heatmap(ends: Sequence[int], scores: Sequence[float], length: int, unit: str) -> bytes:
+def score_heatmap(
+    ends: Sequence[int], scores: Sequence[float], length: int, unit: str, axis: tuple[float, float]
+) -> bytes:
     """A PNG, 256 x 256, of how the score distribution moved: windows of the training by score, each column's darkest
     bin its fullest.
 
     ends: where each episode ended, in the unit that the training's length has; scores: of the same episodes.
+    axis: as in `score_histogram`.
     """
     figure, axes = _square()
     counts, columns, _ = np.histogram2d(
-        np.clip(ends, 0, length), np.clip(scores, *SCORE_RANGE), (np.linspace(0, length, COLUMNS + 1), _edges())
+        np.clip(ends, 0, length), np.clip(scores, *axis), (np.linspace(0, length, COLUMNS + 1), _edges(axis))
     )
-    axes.pcolormesh(columns, _edges(), (counts / np.maximum(counts.max(axis=1, keepdims=True), 1)).T, cmap="Blues")
-    axes.set_yscale("log")
+    axes.pcolormesh(columns, _edges(axis), (counts / np.maximum(counts.max(axis=1, keepdims=True), 1)).T, cmap="Blues")
+    axes.set_yscale(_scale(axis))
     axes.set_xlim(0, length)
-    axes.set_ylim(*SCORE_RANGE)
+    axes.set_ylim(*axis)
     axes.set_title(f"training, {len(scores):,} episodes", fontsize=8)
     axes.set_xlabel(unit, fontsize=7)
     axes.set_ylabel("score", fontsize=7)
@@ -94,16 +97,18 @@ def scene(
     colour = _rgb(ORANGE if source == "random" else BLUE)
     cv2.rectangle(picture, (336, 116), (544, 148), colour, -1)
     write(f"decided by: {source}", 346, 137)
+    pitch = min(52, 228 // len(actions))  # of ALE's eighteen actions, too
     for index, action in enumerate(actions):
-        y = 188 + 52 * index
+        y = 188 + pitch * index
         write(action, 336, y, (255, 255, 255) if index == chosen else (150, 150, 150))
         if q_values is not None:
             write(f"Q {q_values[index]:,.2f}", 452, y, (255, 255, 255) if index == chosen else (150, 150, 150))
             share = float(np.ptp(q_values)) and float((q_values[index] - q_values.min()) / np.ptp(q_values))
-            cv2.rectangle(picture, (336, y + 8), (544, y + 18), (70, 70, 70), -1)
-            cv2.rectangle(picture, (336, y + 8), (336 + round(208 * share), y + 18), _rgb(GREY), -1)
+            if pitch >= 36:
+                cv2.rectangle(picture, (336, y + 8), (544, y + 18), (70, 70, 70), -1)
+                cv2.rectangle(picture, (336, y + 8), (336 + round(208 * share), y + 18), _rgb(GREY), -1)
         if index == chosen:
-            cv2.rectangle(picture, (328, y - 18), (552, y + 24), colour, 2)
+            cv2.rectangle(picture, (328, y - min(18, pitch)), (552, y + min(24, pitch // 2)), colour, 2)
     return picture
 
 
@@ -186,8 +191,12 @@ def run_colour(player: str, sampler: str | None = None) -> str:
     return "#{:02x}{:02x}{:02x}".format(*colour)
 
 
-def _edges() -> npt.NDArray[np.float64]:
-    return np.geomspace(*SCORE_RANGE, BINS + 1)
+def _edges(axis: tuple[float, float]) -> npt.NDArray[np.float64]:
+    return (np.geomspace if _scale(axis) == "log" else np.linspace)(*axis, BINS + 1)
+
+
+def _scale(axis: tuple[float, float]) -> str:
+    return "log" if axis[0] > 0 else "linear"
 
 
 def _square() -> "tuple[Figure, Axes]":

@@ -1,11 +1,48 @@
 """Names and facts that are needed before torch and numpy are there."""
 
-SOURCES = ("centre_vessel", "side_vessel", "centre_bomber", "side_bomber", "wave_bonus")
-"""What pays points in Atlantis.
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
-A vessel pays 100 and a bomber 1,000 where the centre gun hits it, twice as much where a side gun does; the end of a
-wave pays 500 for each building that stands, in one frame.
-"""
+C = TypeVar("C", bound=type)
 
 TABLE_COLUMNS = ("mean", "standard_error", "median", "interquartile_mean", "high", "low")
 """The parts of a score distribution's summary that a line of a table has, in their order."""
+
+
+@dataclass(frozen=True)
+class Game:
+    """What is known of a game of ALE: a component of the kind `env` says it, as class attributes of these names.
+
+    Where it is silent, nothing is said of the game: no parts of a score, no published players, no human-normalised
+    scores.
+    """
+
+    rom: str = ""  # ALE's name of it, which is the component's
+    points: Callable[[int, Any], Sequence[float]] | None = None  # a frame's reward and the RAM to parts, as `sources`
+    actions: tuple[str, ...] = ()  # ALE's minimal action set, in its order
+    score_range: tuple[float, float] = (0.0, 0.0)  # the axis of histograms; logarithmic where it begins above 0
+    episode_steps: int = 1_000  # of a random player, about
+    sources: tuple[str, ...] = ()  # what pays points
+    sources_in_words: str = ""
+    random_score: float = float("nan")  # of the published random player (Quan and Ostrovski, dqn_zoo/atari_data.py)
+    human_score: float = float("nan")  # of the published human; the same table
+    published_in_words: str = ""  # what else to know of published scores
+    held_score: float = float("nan")  # of any one action, held
+    early_frames: int = 0  # of training, up to which published agents stay below the random player or near it
+    early_scores: str = ""  # in words, what they score then
+    keys: tuple[tuple[str, str], ...] = (  # pygame's name of a key to an action, in the order of precedence
+        *(("left", "LEFT"), ("right", "RIGHT"), ("up", "UP"), ("down", "DOWN")),
+        ("space", "FIRE"),
+    )
+    keys_in_words: str = "arrow keys move, space fires"
+
+    @property
+    def is_logarithmic(self) -> bool:
+        """Whether scores are shown on a logarithmic axis."""
+        return self.score_range[0] > 0
+
+
+def component(name: str, *kinds: str) -> Callable[[C], C]:  # noqa: ARG001 - whoever reads the source reads them there
+    """Name a class as a component of these kinds, all of them plain strings: `@component("mynet", "model")`."""
+    return lambda named: named

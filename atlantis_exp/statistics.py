@@ -8,10 +8,6 @@ import numpy.typing as npt
 
 Scores = npt.NDArray[np.float64]
 
-RANDOM_SCORE = 12_850.0  # of the random player, as published; Quan and Ostrovski, dqn_zoo/atari_data.py
-HUMAN_SCORE = 29_028.1  # of the professional tester; the same table
-EARLY_FRAMES = 10_000_000  # of training, up to which published DQN stays below the random player or near it
-
 
 @dataclass(frozen=True)
 class Summary:
@@ -54,9 +50,9 @@ def summarize(scores: Sequence[float] | npt.NDArray[np.float64]) -> Summary:
     )
 
 
-def human_normalised(score: float) -> float:
-    """0 for the published random player, 1 for the published human (Mnih et al. 2015)."""
-    return (score - RANDOM_SCORE) / (HUMAN_SCORE - RANDOM_SCORE)
+def human_normalised(score: float, random: float, human: float) -> float:
+    """0 for the random player's score, 1 for the human's (Mnih et al. 2015)."""
+    return (score - random) / (human - random)
 
 
 def interquartile_mean(scores: Scores) -> float:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.preprocessing import Preprocessing
 from atlantis_exp.networks.resnet import ResNetDQN
@@ -26,6 +27,7 @@ BUDGET = 2**30  # bytes
 def main() -> None:
     """Fill a memory with random play, commit it as a training would, load it, and print the figures."""
     emulator = Emulator(
+        game=facts_of(game_of("Atlantis-v0")),
         preprocessing=Preprocessing(SIZE, (16, 160, 96, 0)),
         frameskip=(2, 5),
         sticky=0.25,

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.runs.journal import Journal, NullJournal, Tracker
 from atlantis_exp.tracking.store import Publisher, Store
 from atlantis_exp.training.evaluation import Episode, Evaluation
@@ -178,10 +179,11 @@ def _evaluation() -> Evaluation:
             4 * _EPISODE_STEPS,
             actions=bytearray(rng.integers(4, size=_EPISODE_STEPS, dtype=np.uint8)),
             random=bytearray(rng.integers(2, size=_EPISODE_STEPS, dtype=np.uint8)),
+            points=[0.0] * 5,
         )
         for index in range(100)
     ]
-    return Evaluation(0.05, episodes)
+    return Evaluation(0.05, episodes, facts_of(game_of("Atlantis-v0")))
 
 
 if __name__ == "__main__":

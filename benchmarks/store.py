@@ -19,6 +19,7 @@ from atlantis_exp.commands.compare import VERB as COMPARE
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.commands.report import VERB as REPORT
 from atlantis_exp.commands.sync import VERB as SYNC
+from atlantis_exp.components import facts_of
 from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import Result, RunFolder, evaluation_at
 from atlantis_exp.runs.journal import Commit, commit_bytes, read_commit
@@ -53,10 +54,18 @@ def write_runs(outputs: Path, runs: int, episodes: int, distinct: int) -> list[J
         (folder.path / "commit.json").write_bytes(commit_bytes(commit))
         steps = episodes * STEPS_PER_EPISODE
         played = [
-            Episode(index, score, 800, False, bytearray([0, 1, 2, 3] * 200), bytearray([0, 0, 0, 1] * 200))
+            Episode(
+                index,
+                score,
+                800,
+                False,
+                bytearray([0, 1, 2, 3] * 200),
+                bytearray([0, 0, 0, 1] * 200),
+                points=[score, *[0.0] * 4],
+            )
             for index, score in enumerate(100.0 * rng.integers(50, 500, size=100))
         ]
-        evaluation = Evaluation(config.evaluation.epsilon, played)
+        evaluation = Evaluation(config.evaluation.epsilon, played, facts_of(config.game))
         table = folder.artifact(evaluation_at(steps))
         table.parent.mkdir(parents=True)
         table.write_text(evaluation.table().to_csv())

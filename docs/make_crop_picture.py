@@ -14,7 +14,7 @@ from matplotlib.patches import Rectangle
 from atlantis_exp.build import make_emulator
 from atlantis_exp.commands.composing import CONF, checked
 from atlantis_exp.commands.query import QueryConfig
-from atlantis_exp.game.emulator import ACTIONS
+from atlantis_exp.game.atlantis import Atlantis
 
 SIZES = (84, 159)  # of DQNCnn and ResNetDQN, pixels
 LANES = (19, 40, 61, 82)  # first rows of the ships' lanes
@@ -26,7 +26,7 @@ def main() -> None:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         env = checked(QueryConfig, compose("query")).env
     up, right, down, left = env.crop
-    actions = np.random.default_rng(0).integers(len(ACTIONS), size=STEPS)
+    actions = np.random.default_rng(0).integers(len(Atlantis.actions), size=STEPS)
     observations = []
     for size in SIZES:
         emulator = make_emulator(dataclasses.replace(env, size=size))()

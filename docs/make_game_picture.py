@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from atlantis_exp.build import build_emulators, make_emulator
-from atlantis_exp.game.emulator import ACTIONS
+from atlantis_exp.game.atlantis import Atlantis
 from atlantis_exp.media import scene
 from atlantis_exp.sessions.cards import build_exported_actor, read_card
 from atlantis_exp.training.evaluation import evaluate
@@ -35,7 +35,7 @@ def main() -> None:
     for is_random, source in ((False, "network"), (True, "random")):
         step, moment = latest[is_random]
         lines = (f"step {step:,}", f"score {moment.score:,.0f}")
-        pictures.append(scene(moment.screen, lines, source, ACTIONS, moment.action, moment.q_values))
+        pictures.append(scene(moment.screen, lines, source, Atlantis.actions, moment.action, moment.q_values))
     cv2.imwrite("docs/images/game.png", cv2.cvtColor(np.hstack(pictures), cv2.COLOR_RGB2BGR))
 
 

@@ -1,4 +1,4 @@
-"""Make `atlantis_exp/game/states.npz`, the archived game states that `compare why=true` asks networks about.
+"""Make `atlantis_exp/game/atlantis_states.npz`, the archived game states that `compare why=true` asks networks about.
 
 `python docs/make_states.py`, from the root of the checkout: minutes on one core. The same machine makes the same
 bytes; elsewhere a rounding may lead to other games, so the file in the repository is the archive, and its SHA-256 is in
@@ -13,13 +13,15 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.game.archive import FRAMES
-from atlantis_exp.game.emulator import ACTIONS, Emulator
+from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.preprocessing import FrameStack, Preprocessing
 from atlantis_exp.sessions.cards import build_exported_actor, read_card
 from atlantis_exp.training.actor import Actor, RandomActor
 
-STATES = Path("atlantis_exp/game/states.npz")
+GAME = facts_of(game_of("Atlantis-v0"))
+STATES = Path("atlantis_exp/game/atlantis_states.npz")
 MOST_FRAMES = 30_000  # of a game, more than eight minutes
 EPSILON = 0.05
 FRAMESKIP = (2, 5)  # frames a decision, drawn as in Atlantis-v0
@@ -43,7 +45,7 @@ def main() -> None:
     players = [
         network("cnn_fast", games=3, moments=16),
         network("resnet_fast", games=3, moments=16),
-        Player("random", RandomActor(len(ACTIONS)), Preprocessing(8, (0, 160, 210, 0)), 1, games=8, moments=4),
+        Player("random", RandomActor(len(GAME.actions)), Preprocessing(8, (0, 160, 210, 0)), 1, games=8, moments=4),
     ]
     states: list[Pixels] = []
     origins: list[tuple[str, int, int]] = []
@@ -74,6 +76,7 @@ def network(name: str, games: int, moments: int) -> Player:
 def emulator(preprocessing: Preprocessing) -> Emulator:
     """One whose step is one frame, so that every frame is seen."""
     return Emulator(
+        game=GAME,
         preprocessing=preprocessing,
         frameskip=1,
         sticky=0.25,

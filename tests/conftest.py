@@ -26,6 +26,7 @@ from atlantis_exp.build import build_trainer
 from atlantis_exp.checking import to_dict
 from atlantis_exp.commands import main
 from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.components import facts_of
 from atlantis_exp.config import Config
 from atlantis_exp.runs.folder import Result, RunFolder, evaluation_at
 from atlantis_exp.runs.journal import Journal
@@ -265,7 +266,7 @@ def recorded(tiny: Callable[..., Config]) -> Callable[..., Path]:
             )
             for index, score in enumerate(scores)
         ]
-        evaluation = Evaluation(config.evaluation.epsilon, episodes)
+        evaluation = Evaluation(config.evaluation.epsilon, episodes, facts_of(config.game))
         journal.artifact(evaluation_at(steps), evaluation.table().to_csv().encode())
         journal.finish()
         folder.write_result(Result("finished", steps, {}, evaluation.metrics(), evaluation.report()))

@@ -11,13 +11,15 @@ import pytest
 from atlantis_exp import media
 from atlantis_exp.media import BLUE, ORANGE, curves, film, run_colour, scene, score_heatmap, score_histogram, strips
 
+AXIS = (1e3, 1e6)
+
 
 def pixels(png: bytes) -> npt.NDArray[np.uint8]:
     return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR_RGB), np.uint8)
 
 
 def test_a_histogram_is_a_png_of_256_by_256_pixels() -> None:
-    png = score_histogram([2_000.0, 8_000.0, 62_500.0], "episodes 1-3")
+    png = score_histogram([2_000.0, 8_000.0, 62_500.0], "episodes 1-3", AXIS)
     assert png.startswith(b"\x89PNG")
     assert pixels(png).shape == (256, 256, 3)
 
@@ -32,22 +34,22 @@ def coloured(picture: npt.NDArray[np.uint8], colour: str) -> npt.NDArray[np.bool
 
 
 def test_a_score_stands_in_the_same_column_whatever_else_is_drawn() -> None:
-    alone = bars(score_histogram([10_000.0] * 3, "x"))
-    among = bars(score_histogram([10_000.0] * 3 + [100_000.0] * 3, "x"))
+    alone = bars(score_histogram([10_000.0] * 3, "x", AXIS))
+    among = bars(score_histogram([10_000.0] * 3 + [100_000.0] * 3, "x", AXIS))
     assert alone.size > 0
     assert set(alone.tolist()) - {alone.min(), alone.max()} <= set(among.tolist())
     assert among.max() > alone.max() + 20
 
 
 def test_scores_beyond_the_axis_stand_at_its_ends() -> None:
-    assert score_histogram([100.0], "x").startswith(b"\x89PNG")
-    low, high = bars(score_histogram([0.0] * 2, "x")), bars(score_histogram([4e6] * 2, "x"))
+    assert score_histogram([100.0], "x", AXIS).startswith(b"\x89PNG")
+    low, high = bars(score_histogram([0.0] * 2, "x", AXIS)), bars(score_histogram([4e6] * 2, "x", AXIS))
     assert 0 < low.max() < high.min()
 
 
 def test_a_share_stands_as_high_whatever_else_is_drawn() -> None:
     def height(scores: list[float]) -> int:
-        return int(coloured(pixels(score_histogram(scores, "x")), BLUE).sum(axis=0).max())
+        return int(coloured(pixels(score_histogram(scores, "x", AXIS)), BLUE).sum(axis=0).max())
 
     assert height([10_000.0] * 4) == height([10_000.0] * 400) > 100
     half = height([10_000.0] * 2 + [100_000.0] * 2)
@@ -59,9 +61,9 @@ def test_a_heat_map_grows_to_the_right_on_axes_that_stay() -> None:
         picture = pixels(png).astype(int)
         return np.flatnonzero(((picture[..., 2] - picture[..., 0] > 60) & (picture[..., 2] > 60)).any(axis=0))
 
-    early = dark(score_heatmap([1, 2], [2_000.0, 3_000.0], 100, "episodes"))
-    late = dark(score_heatmap([1, 2, 99], [2_000.0, 3_000.0, 90_000.0], 100, "episodes"))
-    assert pixels(score_heatmap([1], [2_000.0], 100, "episodes")).shape == (256, 256, 3)
+    early = dark(score_heatmap([1, 2], [2_000.0, 3_000.0], 100, "episodes", AXIS))
+    late = dark(score_heatmap([1, 2, 99], [2_000.0, 3_000.0, 90_000.0], 100, "episodes", AXIS))
+    assert pixels(score_heatmap([1], [2_000.0], 100, "episodes", AXIS)).shape == (256, 256, 3)
     assert set(early.tolist()) < set(late.tolist())
     assert late.max() - early.max() > 150
 

@@ -15,8 +15,6 @@ from hypothesis import strategies as st
 from rliable import metrics
 
 from atlantis_exp.statistics import (
-    HUMAN_SCORE,
-    RANDOM_SCORE,
     Scores,
     human_normalised,
     interquartile_mean,
@@ -160,5 +158,6 @@ def test_a_bootstrap_of_nothing_is_refused() -> None:
 
 
 def test_human_normalised_is_zero_for_the_random_player_and_one_for_the_human() -> None:
-    assert (human_normalised(RANDOM_SCORE), human_normalised(HUMAN_SCORE)) == (0, 1)
-    assert human_normalised(85_641.0) == pytest.approx(4.499, abs=1e-3)  # 449.9 % in Mnih et al. 2015
+    random, human = 12_850.0, 29_028.1
+    assert [human_normalised(score, random, human) for score in (random, human)] == [0, 1]
+    assert human_normalised(85_641.0, random, human) == pytest.approx(4.499, abs=1e-3)  # 449.9 % in Mnih et al. 2015

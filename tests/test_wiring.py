@@ -177,7 +177,7 @@ def test_every_option_of_agent_is_the_player_it_names(option: str) -> None:
     name, settings = BUILT["agent"][option]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = checked(BaselineConfig, compose("baseline", [f"agent={option}"]))
-    actor = build_baseline(config.agent)
+    actor = build_baseline(config.agent, config.env)
     assert (type(actor).__name__, attributes(actor, settings)) == (name, settings)
 
 
@@ -312,6 +312,7 @@ def test_without_a_terminal_a_line_now_and_then_says_how_far_a_training_is(monke
         progress=Progress(Console(file=text, width=80, soft_wrap=True)),
         evaluate=unused,
         film=unused,
+        score_range=(0.0, 1.0),
     )
     recorder.begin(counters, None)
     recorder._pace = Pace(lambda: now)

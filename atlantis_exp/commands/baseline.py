@@ -1,30 +1,49 @@
 """`python -m atlantis_exp baseline`: a player without a network as a tracked run (report figures 1.4 and 1.5)."""
 
 from collections.abc import Callable
+from dataclasses import field
 from functools import partial
 
 from pydantic.dataclasses import dataclass
 
 from atlantis_exp.checking import digest, to_dict
 from atlantis_exp.commands.app import Asked, Verb
-from atlantis_exp.config import STRICT, BaselineAgentConfig, EnvConfig, EvaluationConfig, PathsConfig, TrackingConfig
+from atlantis_exp.components import facts_of
+from atlantis_exp.config import (
+    STRICT,
+    BaselineAgentConfig,
+    Env,
+    EvaluationConfig,
+    PathsConfig,
+    Plugins,
+    TrackingConfig,
+)
+from atlantis_exp.faults import ConfigError
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class BaselineConfig:
     """A tracked run of a player without a network."""
 
+    plugins: Plugins = field(default_factory=dict)  # that its game is of; first, since the game needs it
     agent: BaselineAgentConfig
-    env: EnvConfig
+    env: Env
     evaluation: EvaluationConfig
     tracking: TrackingConfig
     paths: PathsConfig
+
+    def __post_init__(self) -> None:
+        actions = facts_of(self.env.game).actions
+        if self.agent.action >= len(actions):
+            named = ", ".join(f"{index} {name}" for index, name in enumerate(actions))
+            raise ConfigError(f"agent.action={self.agent.action}: {self.env.title} has no such action (valid: {named})")
 
     def identity(self) -> str:
         """Ten hexadecimal digits that are equal exactly for baselines with the same numbers."""
         env = to_dict(self.env)
         del env["workers"]
-        return digest({"agent": to_dict(self.agent), "env": env, "evaluation": to_dict(self.evaluation)})
+        plugins = {"plugins": {name: to_dict(each) for name, each in self.plugins.items()}} if self.plugins else {}
+        return digest({**plugins, "agent": to_dict(self.agent), "env": env, "evaluation": to_dict(self.evaluation)})
 
     def run_name(self) -> str:
         """The player, its action where it has one, and the identity."""

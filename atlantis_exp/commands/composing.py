@@ -3,9 +3,9 @@
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import MISSING
+from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from hydra import initialize_config_dir
 from hydra._internal.hydra import Hydra
@@ -20,13 +20,13 @@ from yaml import YAMLError
 from atlantis_exp import components
 from atlantis_exp.checking import parse
 from atlantis_exp.commands import VERBS
-from atlantis_exp.config import Config, record_plugins
+from atlantis_exp.config import record_plugins
 from atlantis_exp.faults import ConfigError
 
 T = TypeVar("T")
 
-_LIKE = {"model": "cnn", "objective": "dqn"}
-"""Of each kind whose components have keys besides their settings, ours with these alone."""
+_LIKE = {"model": "cnn", "objective": "dqn", "env": "atlantis_standard"}
+"""Of each kind whose components have keys besides their settings, ours with these alone; of games the protocol."""
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent
@@ -73,7 +73,7 @@ def checked(schema: type[T], composed: DictConfig) -> T:
     composition = OmegaConf.to_container(composed, resolve=True)
     assert isinstance(composition, dict)
     tree = {str(key): value for key, value in composition.items() if key != "plugins"}
-    if issubclass(schema, Config):
+    if "plugins" in {each.name for each in fields(cast(Any, schema))}:
         record_plugins(tree)
     paths = tree.get("paths")
     if isinstance(paths, dict) and isinstance(paths.get("outputs"), str) and paths["outputs"]:
@@ -88,13 +88,19 @@ def admit(plugins: Any) -> None:
         raise ConfigError(f"plugins={plugins}: write files and distributions, as in plugins=[./mynet.py,mypackage]")
     components.admit(references)
     for component in components.admitted().values():
+        if (CONF / component.kind / f"{component.name}.yaml").is_file():
+            raise ConfigError(
+                f"{component.source.path}:{component.line}: {component.kind}={component.name} is one of our presets "
+                "and is not replaced; give yours another name"
+            )
         ConfigStore.instance().store(name=component.name, group=component.kind, node=_option(component))
 
 
 def _option(component: components.Component) -> dict[str, Any]:
     """What choosing a plugin's component puts into the config: its constructor's defaults and, over them, its YAML."""
     node: dict[str, Any] = {"defaults": [_LIKE[component.kind], "_self_"]} if component.kind in _LIKE else {}
-    node["name"] = component.name
+    own = ("id", components.game_ids(component.name)[1]) if component.kind == "env" else ("name", component.name)
+    node.update([own])
     if component.kind == "model":
         node["input_size"] = component.facts["input_size"]
     node |= {each.name: "???" if each.default is MISSING else each.default for each in component.settings}
@@ -106,8 +112,8 @@ def _option(component: components.Component) -> dict[str, Any]:
             raise ConfigError(f"{path}: {' '.join(str(error).split())}") from None
         if not isinstance(values, dict) or "defaults" in values:
             raise ConfigError(f"{path}: should hold settings, KEY: VALUE a line, and no defaults list")
-        if values.setdefault("name", component.name) != component.name:
-            raise ConfigError(f"{path}: name should be {component.name}, as the file is called")
+        if values.setdefault(*own) != own[1]:
+            raise ConfigError(f"{path}: {own[0]} should be {own[1]}, as the file is called")
         node |= {str(key): value for key, value in values.items()}
     return node
 

@@ -14,6 +14,8 @@ from atlantis_exp.components import KINDS, NAME, built_in
 from atlantis_exp.config import STRICT
 from atlantis_exp.faults import ConfigError
 
+_KINDS = tuple(kind for kind in KINDS if kind != "env")  # a game is facts, which no template has
+
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class NewConfig:
@@ -24,7 +26,7 @@ class NewConfig:
 
     def __post_init__(self) -> None:
         if len(self.named) != 1:
-            raise ConfigError(f"new: name one component, as one of {', '.join(KINDS)}: model=mynet")
+            raise ConfigError(f"new: name one component, as one of {', '.join(_KINDS)}: model=mynet")
         ((kind, name),) = self.named.items()
         if not re.fullmatch(NAME, name):
             raise ConfigError(f"{kind}={name}: a name is of small letters, digits and underscores, as in {kind}=mynet")
@@ -42,7 +44,7 @@ class NewConfig:
 def _spell_out(arguments: list[str]) -> list[str]:
     """Let `model=` on the command line be the component's."""
     # Hydra itself would take `model` for the config group of that name.
-    return [re.sub(rf"^({'|'.join(KINDS)})=", r"component.\1=", argument) for argument in arguments]
+    return [re.sub(rf"^({'|'.join(_KINDS)})=", r"component.\1=", argument) for argument in arguments]
 
 
 def _work(asked: Asked[NewConfig]) -> Callable[[], None]:

@@ -8,7 +8,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
-from atlantis_exp.config import STRICT, EnvConfig, EvaluationConfig, PathsConfig, TrackingConfig
+from atlantis_exp.config import STRICT, Env, EvaluationConfig, PathsConfig, TrackingConfig
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -17,7 +17,7 @@ class PlayConfig:
 
     player: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")]
     scale: Annotated[int, Field(ge=1, le=10)]  # window pixels a screen pixel
-    env: EnvConfig
+    env: Env
     evaluation: EvaluationConfig
     tracking: TrackingConfig
     paths: PathsConfig

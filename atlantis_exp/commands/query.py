@@ -6,14 +6,14 @@ from functools import partial
 from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
-from atlantis_exp.config import STRICT, EnvConfig
+from atlantis_exp.config import STRICT, Env
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class QueryConfig:
     """The environment query of report figures 1.1 to 1.3."""
 
-    env: EnvConfig
+    env: Env
 
 
 def _work(asked: Asked[QueryConfig]) -> Callable[[], None]:

@@ -9,8 +9,7 @@ from typing import Any
 
 from atlantis_exp.comparison.gather import AXES
 from atlantis_exp.comparison.published import Row, Table
-from atlantis_exp.comparison.report import COLUMNS, cells, number, shown_columns
-from atlantis_exp.registry import SOURCES
+from atlantis_exp.comparison.report import COLUMNS, cells, label, number, shown_columns
 
 _FRACTION = "fraction"
 """The unit of shares and probabilities, from 0 to 1; LaTeX has percent instead, as a person reads them."""
@@ -19,7 +18,7 @@ _POINTS = (
     *("iqm", "iqm_low", "iqm_high", "mean", "mean_low", "mean_high", "median", "median_low", "median_high"),
     *("low", "high", "lower_quartile", "upper_quartile", "standard_error", "score", "tau"),
     *("leader_score", "other_score", "difference", "difference_low", "difference_high"),
-    *("upper_score", "lower_score", "detectable", "delta", "score_low", "score_high", *SOURCES),
+    *("upper_score", "lower_score", "detectable", "delta", "score_low", "score_high"),
     *("later_score", "other_later_score"),
 )
 _FRACTIONS = (
@@ -43,13 +42,13 @@ UNITS: Mapping[str, str] = {
     **dict.fromkeys(("seeds", "next_look"), "seeds"),
 }
 """A column of a comparison's tables, or of `load_runs`, to its unit; frames are the emulator's, FLOPs those of gradient
-updates. A column that is not here counts something that its name says, or is no quantity."""
+updates. A column that is not here counts something that its name says, is what pays points in a game (in points),
+or is no quantity."""
 
 _UNITS_OF: Mapping[str, Mapping[str, str]] = {
     "partings": {"step": "steps", "frame": "frames"},
     "improvement": {"low": _FRACTION, "high": _FRACTION},
     "profile": {"low": _FRACTION, "high": _FRACTION},
-    "why": dict.fromkeys(SOURCES, "points/1,000 frames"),
 }
 """Where a table's column has another unit than that of its name elsewhere."""
 
@@ -59,6 +58,8 @@ _AXIS_UNITS = {name: UNITS[axis] for axis, view in AXES.items() for name in (axi
 
 def unit(name: str, column: str) -> str:
     """The unit of a column of a comparison's table, empty where it has none or one a row (`at` and `x`)."""
+    if name == "why" and column not in COLUMNS["why"]:  # what pays points in the game
+        return UNITS["points_per_1000_frames"]
     return _UNITS_OF.get(name, {}).get(column, UNITS.get(column, ""))
 
 
@@ -78,7 +79,7 @@ def to_latex(name: str, table: Table) -> str:
         return ""
     known = name in COLUMNS
     columns = (
-        {column: COLUMNS[name][column] for column in shown_columns(name, table)}
+        {column: label(name, column) for column in shown_columns(name, table)}
         if known
         else {key: key.replace("_", " ") for key in _shown(table)}
     )

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from html import escape
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,6 @@ from atlantis_exp.comparison.gather import AXES
 from atlantis_exp.comparison.published import Table, random_line
 from atlantis_exp.comparison.tables import Comparison
 from atlantis_exp.media import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
-from atlantis_exp.registry import SOURCES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -80,13 +80,14 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
         + _said([row["group"] for row in scores], scores, "score"),
         height=1.2 + 0.45 * len(scores),
     )
-    drawn["why"] = _render(
-        partial(_why, comparison=comparison),
-        "Rate and survival",
-        "Points per 1,000 emulator frames, split by what paid them, and at each bar the mean frames of an episode; "
-        "rates: " + _said(groups, tables["why"], "points_per_1000_frames"),
-        height=1.6 + 0.6 * len(groups),
-    )
+    if comparison.game.sources:
+        drawn["why"] = _render(
+            partial(_why, comparison=comparison),
+            "Rate and survival",
+            "Points per 1,000 emulator frames, split by what paid them, and at each bar the mean frames of an episode; "
+            "rates: " + _said(groups, tables["why"], "points_per_1000_frames"),
+            height=1.6 + 0.6 * len(groups),
+        )
     drawn["distribution"] = _render(
         partial(_distribution, comparison=comparison),
         "Distribution of the evaluated scores",
@@ -108,12 +109,14 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
         ),
         height=1.2 + 0.6 * len(groups),
     )
-    drawn["references"] = _render(
-        partial(_references, comparison=comparison),
-        "Beside other players",
-        "Mean scores of the groups among measured players and published algorithms, on a logarithmic axis.",
-        height=1.0 + 0.24 * (len(groups) + len(tables["references"])),
-    )
+    if tables["references"]:
+        drawn["references"] = _render(
+            partial(_references, comparison=comparison),
+            "Beside other players",
+            "Mean scores of the groups among measured players and published algorithms"
+            + (", on a logarithmic axis." if comparison.game.is_logarithmic else "."),
+            height=1.0 + 0.24 * (len(groups) + len(tables["references"])),
+        )
     return drawn
 
 
@@ -175,10 +178,11 @@ def _legend(axes: "Axes", columns: int = 2) -> None:
 
 
 def _reference_lines(draw_line: Callable[..., Any], comparison: Comparison, low: float, high: float) -> None:
-    """The players' scores as grey lines, those that lie within a factor of two of what is drawn."""
+    """The players' scores as grey lines, those that lie within a factor of two, or the width, of what is drawn."""
     references = comparison.tables["references"]
-    shown = [row for row in references if row["kind"] == "player" and low / 2 <= row["score"] <= high * 2]
-    if not random_line(references)["protocol"].startswith("published"):
+    least, most = (low / 2, high * 2) if comparison.game.is_logarithmic else (2 * low - high, 2 * high - low)
+    shown = [row for row in references if row["kind"] == "player" and least <= row["score"] <= most]
+    if (random := random_line(references)) and not random["protocol"].startswith("published"):
         shown = [row for row in shown if row["name"] != "random player"]
     styles = ((0, (1, 1)), (0, (4, 2)), (0, (6, 2, 1, 2)), (0, (2, 3)))
     for index, row in enumerate(shown):
@@ -207,7 +211,7 @@ def _learning(axes: "Axes", comparison: Comparison, axis: str, rows: Table) -> N
             )
     scores = [row["score"] for row in (*rows, *seeds)]
     _reference_lines(axes.axhline, comparison, min(scores), max(scores))
-    axes.set_ylim(0, None)
+    axes.set_ylim(0 if min(scores) >= 0 else None, None)
     axes.set_xlabel(_UNITS[axis])
     axes.set_ylabel("training score, mean of 100")
     axes.locator_params(axis="x", nbins=5)
@@ -259,7 +263,7 @@ def _why(axes: "Axes", comparison: Comparison) -> None:
     rows = comparison.tables["why"]
     for y, row in enumerate(rows):
         rate, left = row["points_per_1000_frames"], 0.0
-        for source, colour in zip(SOURCES, _COLOURS, strict=False):
+        for source, colour in zip(comparison.game.sources, cycle(_COLOURS)):
             label = source.replace("_", " ") if y == 0 else None
             axes.barh(y, row[source], 0.6, left, color=colour, label=label)
             left += row[source]
@@ -268,7 +272,9 @@ def _why(axes: "Axes", comparison: Comparison) -> None:
             axes.barh(y, rate, 0.6, color=_GREY)
             said += ", split not recorded"
         axes.annotate(said, (rate, y), (4, 0), textcoords="offset points", va="center", fontsize=8)
-    axes.set_xlim(0, 1.45 * max(row["points_per_1000_frames"] for row in rows) or 1)
+    rates = [row["points_per_1000_frames"] for row in rows]
+    if min(rates) >= 0:
+        axes.set_xlim(0, 1.45 * max(rates) or 1)
     axes.set_yticks(range(len(rows)), [row["group"] for row in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlabel("points per 1,000 frames")
@@ -298,9 +304,10 @@ def _profile(axes: "Axes", comparison: Comparison) -> None:
         rows = [row for row in comparison.tables["profile"] if row["group"] == group]
         tau, share = ([row[key] for row in rows] for key in ("tau", "share"))
         axes.plot(tau, share, label=group, **_look(comparison.groups, group))
-    axes.set_xscale("log")
+    is_logarithmic = comparison.game.is_logarithmic
+    axes.set_xscale("log" if is_logarithmic else "linear")
     _thousands(axes.xaxis)
-    axes.set_xlabel("score (logarithmic)")
+    axes.set_xlabel(f"score{' (logarithmic)' if is_logarithmic else ''}")
     axes.set_ylabel("share of episodes above")
     axes.set_ylim(0, 1.03)
     _legend(axes)
@@ -314,7 +321,7 @@ def _actions(axes: "Axes", comparison: Comparison) -> None:
         left = 0.0
         for index, row in enumerate(rows[group]):
             label = row["action"] if y == 0 else None
-            colour = _COLOURS[index]
+            colour = _COLOURS[index % len(_COLOURS)]
             axes.barh(y, row["network"], 0.6, left, color=colour, label=label)
             axes.barh(y, row["random"], 0.6, left + row["network"], color=colour, hatch="////", edgecolor="white")
             left += row["network"] + row["random"]
@@ -338,11 +345,12 @@ def _references(axes: "Axes", comparison: Comparison) -> None:
     bars.sort(key=lambda bar: bar[1])
     names, scores, colours = zip(*bars, strict=True)
     axes.barh(range(len(bars)), scores, 0.7, color=colours)
-    axes.set_xscale("log")
+    is_logarithmic = comparison.game.is_logarithmic
+    axes.set_xscale("log" if is_logarithmic else "linear")
     axes.set_yticks(range(len(bars)), names, fontsize=8)
     axes.set_ylim(-0.6, len(bars) - 0.4)
     for y, score in enumerate(scores):
         axes.annotate(f"{score:,.0f}", (score, y), (4, 0), textcoords="offset points", va="center", fontsize=7)
     axes.margins(x=0.12)
     _thousands(axes.xaxis)
-    axes.set_xlabel("mean score (logarithmic)")
+    axes.set_xlabel(f"mean score{' (logarithmic)' if is_logarithmic else ''}")

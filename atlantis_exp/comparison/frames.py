@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from atlantis_exp.checking import flatten, to_dict
 from atlantis_exp.comparison.gather import Training, select
+from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.faults import ConfigError, Fault
-from atlantis_exp.registry import SOURCES
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.facts import read_facts
 from atlantis_exp.runs.folder import EVALUATION, RESULT, Result, RunFolder, all_runs
@@ -39,10 +39,10 @@ _RUN = ("run", "title", "kind", "group", "state", "error", "started", "updated")
 _EVALUATION = (
     *("run", "step", "source", "folder", "final", "epsilon", "evaluation_seed", "episodes"),
     *("mean", "standard_error", "median", "iqm", "lower_quartile", "upper_quartile", "low", "high"),
-    *("points_per_frame", "steps_mean", "truncated_share", "random_share", *SOURCES),
+    *("points_per_frame", "steps_mean", "truncated_share", "random_share"),
 )
 _PLACE = ("run", "step", "source", "folder")  # of an episode: the evaluation that it is of
-_EPISODE = ("episode", "seed", "score", "steps", "frames", "truncated", "random_share", *SOURCES)
+_EPISODE = ("episode", "seed", "score", "steps", "frames", "truncated", "random_share")
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,11 @@ class _Run:
     row: Row = field(default_factory=dict)
     evaluations: list[tuple[Row, Mapping[str, Array]]] = field(default_factory=list)  # each with its episodes
     curve: _Curve = field(default_factory=_Curve)
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """What pays points in its game."""
+        return facts_of(game_of(str(self.config.get("env.id")))).sources
 
     @property
     def facts(self) -> Row:
@@ -227,7 +232,7 @@ def _add_evaluation(
     run: _Run, folder: RunFolder, table: str, step: int, source: str, epsilon: float, seed: int | None
 ) -> None:
     """Add the evaluation of a run whose episodes a folder holds. Raises: as _UNREADABLE."""
-    episodes = EpisodeTable.read(folder.artifact(table))
+    episodes = EpisodeTable.read(folder.artifact(table), run.sources)
     summary = summarize(episodes.scores)
     random = episodes.counts[:, :, 1].sum(axis=1)
     row = {
@@ -251,7 +256,7 @@ def _add_evaluation(
         "steps_mean": float(episodes.steps.mean()),
         "truncated_share": float(episodes.truncated.mean()),
         "random_share": float(random.sum() / episodes.steps.sum()),
-        **dict(zip(SOURCES, episodes.points.mean(axis=0).tolist(), strict=True)),
+        **dict(zip(run.sources, episodes.points.mean(axis=0).tolist(), strict=True)),
     }
     columns = {
         "episode": np.arange(summary.episodes),
@@ -261,7 +266,7 @@ def _add_evaluation(
         "frames": episodes.frames.astype(np.int64),
         "truncated": episodes.truncated.astype(np.bool_),
         "random_share": random / episodes.steps,
-        **dict(zip(SOURCES, episodes.points.T, strict=True)),
+        **dict(zip(run.sources, episodes.points.T, strict=True)),
     }
     run.evaluations.append((row, columns))
 
@@ -291,9 +296,15 @@ def _assemble(read: Sequence[_Run], skipped: dict[str, str]) -> Runs:
 
     # By step, and of one step the training's own first, then the others by their age.
     evaluations = [pair for run in read for pair in sorted(run.evaluations, key=lambda pair: int(pair[0]["step"]))]
+    sources = [*dict.fromkeys(source for run in read for source in run.sources)]
+    columns = [*_EVALUATION, *sources]
     sizes = [row["episodes"] for row, _ in evaluations]
     episodes = {key: np.repeat(np.array([row[key] for row, _ in evaluations], object), sizes) for key in _PLACE}
     episodes |= {key: _joined([columns[key] for _, columns in evaluations]) for key in _EPISODE}
+    for source in sources:  # of a run of another game there is none
+        episodes[source] = _joined(
+            [columns.get(source, np.full(len(columns["score"]), np.nan)) for _, columns in evaluations]
+        )
 
     curves = [run.curve for run in read]
     values = {
@@ -307,7 +318,7 @@ def _assemble(read: Sequence[_Run], skipped: dict[str, str]) -> Runs:
     }
     return Runs(
         runs=runs,
-        evaluations=pd.DataFrame([row for row, _ in evaluations], columns=list(_EVALUATION)).astype({"final": bool}),
+        evaluations=pd.DataFrame([row for row, _ in evaluations], columns=columns).astype({"final": bool}),
         episodes=pd.DataFrame(episodes).infer_objects().astype({"truncated": bool}),
         curves=pd.DataFrame(values).infer_objects(),
         skipped=skipped,

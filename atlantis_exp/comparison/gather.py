@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atlantis_exp.checking import flatten, nearest, parse, to_dict
+from atlantis_exp.components import Component, facts_of, game_of, title_of
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.episodes import EpisodeTable
@@ -62,6 +63,11 @@ class Training:
     def facts(self) -> dict[str, Any]:
         """All that runs can be told apart by: the config and, where it has no such key, the tags."""
         return {**self.tags, **self.config}
+
+    @property
+    def game(self) -> Component | None:
+        """The game; None where it is a plugin's that no command line names."""
+        return game_of(self.config["env.id"])
 
     @property
     def has_collapsed(self) -> bool:
@@ -184,7 +190,18 @@ def resolve(key: str, config: Mapping[str, Any]) -> str:
 
 
 def refuse_mixed_protocols(trainings: Sequence[Training], by: Sequence[str]) -> None:
-    """Raise ConfigError where scores do not mean the same, but for the keys of `by`, which are the question."""
+    """Raise ConfigError where scores do not mean the same, but for the keys of `by`, which are the question.
+
+    Those of different games never do.
+    """
+    games = defaultdict(list)
+    for training in trainings:
+        games[title_of(training.config["env.id"])].append(training.name)
+    if len(games) > 1:
+        raise ConfigError(
+            f"env.id differs: scores of different games are not compared: {_holding(games)}; choose with runs= or "
+            "where=env.id=ID"
+        )
     for key in PROTOCOL:
         if any(key == resolve(asked, training.config) for asked in by for training in trainings):
             continue
@@ -192,16 +209,20 @@ def refuse_mixed_protocols(trainings: Sequence[Training], by: Sequence[str]) -> 
         for training in trainings:
             holders[json.dumps(training.config[key])].append(training.name)
         if len(holders) > 1:
-            named = "; ".join(
-                f"{value} in {names[0]}{f' and {len(names) - 1} more' if len(names) > 1 else ''}"
-                for value, names in holders.items()
-            )
             hint = (
                 "at_epsilon=VALUE takes evaluations at that one, `evaluate run=NAME epsilon=VALUE` makes them"
                 if key == "evaluation.epsilon"
                 else f"choose with runs= or where=, or ask for it with by={key}"
             )
-            raise ConfigError(f"{key} differs, so the scores do not mean the same: {named}; {hint}")
+            raise ConfigError(f"{key} differs, so the scores do not mean the same: {_holding(holders)}; {hint}")
+
+
+def _holding(holders: Mapping[str, Sequence[str]]) -> str:
+    """Which runs have which value."""
+    return "; ".join(
+        f"{value} in {names[0]}{f' and {len(names) - 1} more' if len(names) > 1 else ''}"
+        for value, names in holders.items()
+    )
 
 
 def plays_alike(player: Player, training: Training) -> bool:
@@ -261,7 +282,7 @@ def _training(
     science = config.science()
     science["phase"] = {str(index): phase for index, phase in enumerate(science["phase"])}
     leaves = flatten(to_dict(config)) | {"evaluation.epsilon": taken}
-    episodes = EpisodeTable.read(path)
+    episodes = EpisodeTable.read(path, facts_of(config.env.game).sources)
     if not np.isfinite(episodes.scores).all():
         raise ValueError(f"{path} has a score that is no finite number")
     return Training(folder.name, leaves, flatten(science), arrays, episodes, tags, policy)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from atlantis_exp.comparison.gather import AXES, COMMIT, Training, resolve
 from atlantis_exp.comparison.published import Table, early_dqn, random_line
 from atlantis_exp.comparison.verdict import Answer, counted
+from atlantis_exp.components import Component, facts_of
 from atlantis_exp.decision import FEWEST_SEEDS, equal_scores
 from atlantis_exp.runs.folder import LOST
-from atlantis_exp.statistics import EARLY_FRAMES
 
 _NAMED = 6  # runs, up to which a line names them
 
@@ -19,6 +19,7 @@ _NAMED = 6  # runs, up to which a line names them
 class Facts:
     """All that a note may be about."""
 
+    game: Component | None
     groups: Mapping[str, Sequence[Training]]
     by: Sequence[str]
     answers: Sequence[Answer]
@@ -206,15 +207,17 @@ def capped(facts: Facts) -> Iterator[str]:
 
 def other_players(facts: Facts) -> Iterator[str]:
     """What the random player's line is worth."""
-    random_player = random_line(facts.tables["references"])
+    if (random_player := random_line(facts.tables["references"])) is None:
+        return
     if random_player["protocol"].startswith("published"):
         yield (
             "No random player was measured under these settings, so a published one takes its place; "
             "python -m atlantis_exp baseline with the same env measures one."
         )
     scores = [row["score"] for row in facts.tables["scores"]]
-    if facts.frames <= EARLY_FRAMES and any(score < random_player["score"] for score in scores):
-        yield early_dqn()
+    is_early = facts.frames <= facts_of(facts.game).early_frames
+    if is_early and any(score < random_player["score"] for score in scores) and (why := early_dqn(facts.game)):
+        yield why
 
 
 BESIDE: Sequence[Callable[[Facts], Iterator[str]]] = (

@@ -1,38 +1,59 @@
-"""What others have scored: the tables that ship with the package, with their protocols and sources."""
+"""What others have scored in a game: what comes with it, with protocols and sources."""
 
 import csv
 import io
-from importlib.resources import files
+from math import isnan
 from typing import Any
 
-from atlantis_exp.statistics import RANDOM_SCORE
+from atlantis_exp.components import Component, facts_of
+from atlantis_exp.runs.files import SMALL, read_file
 
 Row = dict[str, Any]
 Table = list[Row]
 
 
-def literature(name: str) -> Table:
-    """The published `scores` (players and algorithms) or learning `curves` that ship with the package, with sources."""
-    text = (files("atlantis_exp.comparison") / f"published_{name}.csv").read_text("utf-8")
-    table: Table = list(csv.DictReader(io.StringIO(text)))
+def scores(game: Component | None) -> Table:
+    """The published scores of a game, of players and algorithms, with sources; none where nobody says any."""
+    facts = facts_of(game)
+    players = {"random player": facts.random_score, "human": facts.human_score}
+    source = "dqn_zoo/atari_data.py (Quan and Ostrovski 2020)"
+    return [
+        *(
+            {"name": name, "score": score, "kind": "player", "protocol": "published, no-op starts", "source": source}
+            for name, score in players.items()
+            if not isnan(score)
+        ),
+        *_read(game, "scores.csv"),
+    ]
+
+
+def curves(game: Component | None) -> Table:
+    """The published learning curves of a game, with sources; none where nobody says any."""
+    return [{**row, "frames": 1e6 * float(row.pop("frames_millions"))} for row in _read(game, "curves.csv")]
+
+
+def _read(game: Component | None, name: str) -> Table:
+    if game is None or not (path := game.beside(name)).is_file():
+        return []
+    table: Table = list(csv.DictReader(io.StringIO(read_file(path.resolve(), SMALL).decode())))
     for row in table:
         for key in {"score", "mean", "low", "high", "seeds"} & row.keys():
             row[key] = float(row[key])
-        if "frames_millions" in row:
-            row["frames"] = 1e6 * float(row.pop("frames_millions"))
     return table
 
 
-def random_line(references: Table) -> Row:
-    """The random player measured under the runs' own settings, else the published one."""
-    return next(row for row in references if row["name"].startswith("random"))
+def random_line(references: Table) -> Row | None:
+    """The random player measured under the runs' own settings, else the published one, if there is one."""
+    return next((row for row in references if row["name"].startswith("random")), None)
 
 
-def early_dqn() -> str:
-    """Why below random is no bug, from the published learning curves."""
-    at = [row for row in literature("curves") if row["name"].startswith("DQN") and row["frames"] == 5e6]
+def early_dqn(game: Component | None) -> str:
+    """Why below random is no bug, from the published learning curves; empty where there are none."""
+    at = [row for row in curves(game) if row["name"].startswith("DQN") and row["frames"] == 5e6]
+    if not at:
+        return ""
     low, high = min(row["mean"] for row in at), max(row["mean"] for row in at)
     return (
         f"At 5 M frames published DQN scores {low:,.0f} to {high:,.0f}, below the random player's "
-        f"{RANDOM_SCORE:,.0f}: below random is normal here ({at[0]['source'].rpartition('/')[0]})."
+        f"{facts_of(game).random_score:,.0f}: below random is normal here ({at[0]['source'].rpartition('/')[0]})."
     )

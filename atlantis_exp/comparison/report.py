@@ -8,7 +8,6 @@ from jinja2 import Environment, StrictUndefined
 from atlantis_exp.comparison.figures import Drawn
 from atlantis_exp.comparison.published import Row, Table
 from atlantis_exp.comparison.tables import Comparison
-from atlantis_exp.registry import SOURCES
 
 
 def page(comparison: Comparison, figures: Mapping[str, Drawn], facts: Mapping[str, str]) -> str:
@@ -57,7 +56,6 @@ COLUMNS = {
         "frames_mean": "frames an episode",
         "time_cap_share": "at time cap",
         "points_per_1000_frames": "points per 1,000 frames",
-        **{source: source.replace("_", " ") for source in SOURCES},
     },
     "modes": {
         "group": "group",
@@ -138,7 +136,12 @@ _ENDS = {
 
 def titles(name: str, table: Table) -> list[str]:
     """The header of a shown table."""
-    return [COLUMNS[name][column] for column in shown_columns(name, table)]
+    return [label(name, column) for column in shown_columns(name, table)]
+
+
+def label(name: str, column: str) -> str:
+    """How a person calls a column of a shown table."""
+    return COLUMNS[name].get(column, column.replace("_", " "))
 
 
 def cells(name: str, row: Row, table: Table) -> list[tuple[str, bool]]:
@@ -155,13 +158,19 @@ def cells(name: str, row: Row, table: Table) -> list[tuple[str, bool]]:
 
 
 def shown_columns(name: str, table: Table) -> list[str]:
-    """The columns of a table that are shown: without a baseline no differences to one, of one family not its name."""
+    """The columns of a table that are shown: without a baseline no differences to one, of one family not its name.
+
+    Of `why` there are further ones: what pays points in the game.
+    """
     hidden = set()
     if name == "scores" and not any(row["baseline"] for row in table):
         hidden |= {"difference", "said"}
     if len({row.get("family") for row in table}) == 1:
         hidden.add("family")
-    return [column for column in COLUMNS[name] if column not in hidden]
+    if table:
+        hidden |= COLUMNS[name].keys() - table[0].keys()
+    more = [column for column in table[0] if column not in COLUMNS[name]] if name == "why" and table else []
+    return [column for column in (*COLUMNS[name], *more) if column not in hidden]
 
 
 def number(value: object, column: str = "") -> str:

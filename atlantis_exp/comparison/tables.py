@@ -6,16 +6,18 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from math import isnan
 
 import numpy as np
 
 from atlantis_exp.comparison.gather import AXES, Array, Gathered, Player, Training, plays_alike
 from atlantis_exp.comparison.notes import BESIDE, NOTES, Facts
-from atlantis_exp.comparison.published import Row, Table, literature
+from atlantis_exp.comparison.published import Row, Table, curves, scores
 from atlantis_exp.comparison.verdict import Answer, Question, answer, counted, families, group_of
 from atlantis_exp.comparison.words import said
+from atlantis_exp.components import facts_of, title_of
 from atlantis_exp.decision import FEWEST_SEEDS, Look, Plan, Verdict, decide, mean_interval, modes
-from atlantis_exp.registry import SOURCES
+from atlantis_exp.registry import Game
 from atlantis_exp.statistics import Scores, human_normalised, probability_of_improvement, summarize
 
 Groups = Mapping[str, Sequence[Training]]
@@ -28,6 +30,8 @@ _NAN = float("nan")
 class Comparison:
     """All that is known about some groups of runs."""
 
+    title: str  # of the game
+    game: Game
     groups: list[str]
     by: list[str]
     answers: list[Answer]
@@ -53,16 +57,18 @@ def compare(
     Raises:
         ConfigError: for a baseline that is none of what is compared.
     """
-    scores = [group_of(runs, question.by) for runs in groups.values()]
-    answers = answer(families(scores, question), record or {}, now)
+    seeds_of = [group_of(runs, question.by) for runs in groups.values()]
+    answers = answer(families(seeds_of, question), record or {}, now)
     trainings = [training for runs in groups.values() for training in runs]
+    component = trainings[0].game
+    game = facts_of(component)
     players = [player for player in gathered.players if plays_alike(player, trainings[0])]
     frames = max((training.curve["frames"][-1] for training in trainings if training.curve), default=0.0)
-    by_label = {group.label: group.seeds for group in scores}
+    by_label = {group.label: group.seeds for group in seeds_of}
     named: list[tuple[str, dict[str, dict[int, float]], Answer | None]] = [
         (each.family.name, each.family.seeds, each) for each in answers
     ] or [("all", by_label, None)]
-    evaluation = [_evaluation(label, runs) for label, runs in groups.items()]
+    evaluation = [_evaluation(label, runs, game) for label, runs in groups.items()]
     tables: dict[str, Table] = {
         "scores": [row for family in named for row in _scores(*family)],
         "seeds": [
@@ -75,7 +81,7 @@ def compare(
         "plan": [_plan(each) for each in answers],
         "looks": [row for each in answers for row in _looks(each)],
         "evaluation": evaluation,
-        "why": [_why(label, runs) for label, runs in groups.items()],
+        "why": [_why(label, runs, game.sources) for label, runs in groups.items()],
         "modes": [row for row in evaluation for row in _modes(row, by_label[row["group"]])],
         "improvement": _improvement(groups),
         "views": _views(groups),
@@ -84,21 +90,22 @@ def compare(
         "seed_curves": [
             row for axis in AXES for label, runs in groups.items() for row in _seed_curves(axis, label, runs)
         ],
-        "profile": _profile(groups),
+        "profile": _profile(groups, game),
         "actions": [row for label, runs in groups.items() for row in _actions(label, runs)],
         "episodes": [row for label, runs in groups.items() for training in runs for row in _episodes(label, training)],
-        "references": [_measured(player) for player in players] + literature("scores"),
-        "published_curves": [row for row in literature("curves") if row["frames"] <= frames],
+        "references": [_measured(player) for player in players] + scores(component),
+        "published_curves": [row for row in curves(component) if row["frames"] <= frames],
         "skipped": [{"run": name, "reason": reason} for name, reason in gathered.skipped.items()],
     }
-    facts = Facts(groups, question.by, answers, tables, float(frames))
+    facts = Facts(component, groups, question.by, answers, tables, float(frames))
     beside, notes = ([line for note in notes for line in note(facts)] for notes in (BESIDE, NOTES))
     if now and answers and all(each.taken is None for each in answers):
         beside.append("look=now took no look: no group that is undecided has new seeds, or one has fewer than five.")
     if training := _in_training(tables["views"]):
         notes.insert(0, training)
     verdict, *others = _sentences(answers, list(groups))
-    return Comparison(list(groups), list(question.by), answers, verdict, others, beside, notes, tables)
+    title = title_of(trainings[0].config["env.id"])
+    return Comparison(title, game, list(groups), list(question.by), answers, verdict, others, beside, notes, tables)
 
 
 def to_csv(table: Table) -> str:
@@ -194,12 +201,13 @@ def _pooled(runs: Sequence[Training]) -> Scores:
     return np.concatenate([training.episodes.scores for training in runs])
 
 
-def _evaluation(label: str, runs: Sequence[Training]) -> Row:
+def _evaluation(label: str, runs: Sequence[Training], game: Game) -> Row:
     """What the episodes of a group are like, those of runs that count as one seed once."""
     runs = counted(runs)[0]
     summary = summarize(_pooled(runs))
     frames = np.concatenate([training.episodes.frames for training in runs])
     truncated = np.concatenate([training.episodes.truncated for training in runs])
+    normalised = human_normalised(summary.mean, game.random_score, game.human_score)
     return {
         "group": label,
         "runs": len(runs),
@@ -210,11 +218,11 @@ def _evaluation(label: str, runs: Sequence[Training]) -> Row:
         "high": summary.high,
         "points_per_frame": float(_pooled(runs).sum() / frames.sum()) if frames.sum() else _NAN,
         "time_cap_share": float(truncated.mean()),
-        "human_normalised_mean": human_normalised(summary.mean),
+        **({} if isnan(normalised) else {"human_normalised_mean": normalised}),
     }
 
 
-def _why(label: str, runs: Sequence[Training]) -> Row:
+def _why(label: str, runs: Sequence[Training], sources: Sequence[str]) -> Row:
     """A group's mean score as mean frames an episode times rate, and what the rate is made of.
 
     The rate is in points per 1,000 emulator frames, and its parts sum to it; they are NaN where an episode's are.
@@ -231,7 +239,7 @@ def _why(label: str, runs: Sequence[Training]) -> Row:
         "frames_mean": float(frames.mean()),
         "time_cap_share": float(truncated.mean()),
         "points_per_1000_frames": float(scores.sum() / thousands),
-        **dict(zip(SOURCES, (points.sum(axis=0) / thousands).tolist(), strict=True)),
+        **dict(zip(sources, (points.sum(axis=0) / thousands).tolist(), strict=True)),
     }
 
 
@@ -329,10 +337,14 @@ def _at(training: Training, axis: str, x: float | Array, measure: str = "score")
     return np.asarray(np.interp(x, training.curve[axis], training.curve[measure]), np.float64)
 
 
-def _profile(groups: Groups) -> Table:
+def _profile(groups: Groups, game: Game) -> Table:
     """The share of episodes that score more than tau (Agarwal et al. 2021), for tau over all scores."""
     scores = np.concatenate([_pooled(runs) for runs in groups.values()])
-    taus = np.unique(np.geomspace(max(scores.min() / 2, 100.0), max(scores.max(), 200.0), _GRID))
+    if game.is_logarithmic:
+        least = game.score_range[0] / 10
+        taus = np.unique(np.geomspace(max(scores.min() / 2, least), max(scores.max(), 2 * least), _GRID))
+    else:
+        taus = np.linspace(min(scores.min(), 0.0), max(scores.max(), 1.0), _GRID)
     return [
         {"group": label, "tau": tau, "share": share}
         for label, runs in groups.items()

@@ -1,12 +1,12 @@
-"""The archive: a fixed set of game states that ships with the package, on which any network can be asked.
+"""The archive: a fixed set of a game's states, on which any network that plays it can be asked.
 
 A state is its last frames in palette indices, so that every frameskip, crop, size, pool and stack has its own view of
-the same moment. `docs/make_states.py` made it of games of the networks in `pretrained/` and of a random player.
+the same moment. `docs/make_states.py` made ours of games of the networks in `pretrained/` and of a random player.
 """
 
 import io
 from hashlib import sha256
-from importlib.resources import files
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -27,9 +27,9 @@ class Archive(NamedTuple):
     sha256: str  # of the file
 
 
-def read_archive() -> Archive:
-    """Read the archive of the package."""
-    content = (files("atlantis_exp.game") / "states.npz").read_bytes()
+def read_archive(path: Path) -> Archive:
+    """Read a game's archive."""
+    content = path.read_bytes()
     with np.load(io.BytesIO(content), allow_pickle=False) as stored:
         frames = stored["changes"]
         np.bitwise_xor.accumulate(frames, axis=1, out=frames)

@@ -1,4 +1,4 @@
-"""One Atlantis on ALE: equal to Gymnasium's for the same seed and actions, saved and restored exactly."""
+"""One game on ALE: equal to Gymnasium's for the same seed and actions, saved and restored exactly."""
 
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -6,15 +6,11 @@ from typing import Any, NamedTuple, cast
 import gymnasium
 import numpy as np
 from ale_py import ALEInterface, ALEState, LoggerMode
-from ale_py.roms import get_rom_path
+from ale_py.roms import get_all_rom_ids, get_rom_path
 
+from atlantis_exp.faults import ConfigError
 from atlantis_exp.game.preprocessing import PALETTE, SCREEN_HEIGHT, SCREEN_WIDTH, Pixels, Preprocessing
-from atlantis_exp.registry import SOURCES
-
-ACTIONS = ("NOOP", "FIRE", "RIGHTFIRE", "LEFTFIRE")
-"""ALE's minimal action set of Atlantis; an action is an index into it."""
-
-_WAVE_STATE, _WAVE_OVER = 0x53, 2  # a byte of the console's memory; so from the frame of the bonus to the next wave
+from atlantis_exp.registry import Game
 
 ALEInterface.setLoggerMode(LoggerMode.Error)  # of the whole process, and before the first emulator prints its banner
 
@@ -26,14 +22,16 @@ class Step(NamedTuple):
     reward: float  # the game's own, never clipped
     terminated: bool
     truncated: bool
-    life_lost: bool  # fewer buildings stand than before
+    life_lost: bool  # fewer are left than before
     frames: int  # emulated in this step
-    points: list[float]  # the reward by its source, in the order of SOURCES
+    points: list[float]  # the reward by its source, in the order of the game's sources
 
 
 class Emulator:
-    """One game of Atlantis, from frames to observations; before its first seed it plays as if seeded with 0.
+    """One game, from frames to observations; before its first seed it plays as if seeded with 0.
 
+    game: its ROM, its actions, of which an action is an index, and what pays its points. Raises ConfigError where ALE
+        has no such ROM, or other actions.
     frameskip: frames in a step, or (low, high): drawn from low to high - 1 in every step, as in `Atlantis-v0`.
     sticky: probability that a frame repeats the action of the one before (Machado et al., 2018).
     max_frames: frames after which an episode is truncated.
@@ -46,6 +44,7 @@ class Emulator:
     def __init__(
         self,
         *,
+        game: Game,
         preprocessing: Preprocessing,
         frameskip: int | tuple[int, int],
         sticky: float,
@@ -54,7 +53,7 @@ class Emulator:
         noop_max: int,
         max_pool: bool,
     ) -> None:
-        self.preprocessing = preprocessing
+        self.game, self.preprocessing = game, preprocessing
         self._frameskip = frameskip
         self._max_steps = max_steps
         self._noop_max = noop_max
@@ -67,13 +66,15 @@ class Emulator:
         self._ale.setInt("max_num_frames_per_episode", max_frames)
         self._load_game(seed=0)
         self._actions = self._ale.getMinimalActionSet()
+        if (actions := tuple(action.name for action in self._actions)) != game.actions:
+            raise ConfigError(f"{game.rom}: actions = {game.actions}: should be ALE's, {actions}")
         self._steps = 0
         self._screen: Pixels = np.zeros((SCREEN_HEIGHT, SCREEN_WIDTH), np.uint8)
         self._pool = preprocessing.grey(self._screen)  # of the last step, cropped; max_pool only
 
     @property
     def lives(self) -> int:
-        """Buildings that stand, guns included; it can rise again."""
+        """As ALE counts them; in some games they can rise again."""
         return self._ale.lives()
 
     @property
@@ -108,7 +109,7 @@ class Emulator:
         if not isinstance(frameskip, int):
             frameskip = int(self._generator.integers(*frameskip))
         frames_before, lives_before = self._ale.getFrameNumber(), self._lives
-        self._points = [0.0] * len(SOURCES)
+        self._points = [0.0] * len(self.game.sources)
         if self._max_pool:
             reward = self._act_and_pool(action, frameskip)
         else:
@@ -155,7 +156,9 @@ class Emulator:
         own_seed, ale_seed = np.random.SeedSequence(seed).generate_state(2)
         self._generator = np.random.default_rng(own_seed)
         self._ale.setInt("random_seed", ale_seed.astype(np.int32))
-        self._ale.loadROM(cast(Path, get_rom_path("atlantis")))
+        if self.game.rom not in get_all_rom_ids():
+            raise ConfigError(f"{self.game.rom}: ALE has no ROM of that name")
+        self._ale.loadROM(cast(Path, get_rom_path(self.game.rom)))
         self._keep_origin()
 
     def _keep_origin(self) -> None:
@@ -167,16 +170,9 @@ class Emulator:
     def _act(self, action: int) -> int:
         """Plays one frame and returns its reward, which is added to the step's points by source."""
         reward = self._ale.act(self._actions[action])
-        if reward:
-            points = self._points
-            if self._ale.getRAM()[_WAVE_STATE] == _WAVE_OVER:
-                points[4] += reward
-            else:  # of several hits in one frame the centre gun has one at most
-                bombers, vessels = divmod(reward // 100, 10)
-                points[0] += vessels % 2 * 100
-                points[1] += vessels // 2 * 200
-                points[2] += bombers % 2 * 1_000
-                points[3] += bombers // 2 * 2_000
+        if reward and self.game.points is not None:
+            for source, points in enumerate(self.game.points(reward, self._ale.getRAM())):
+                self._points[source] += points
         return reward
 
     def _act_and_pool(self, action: int, frameskip: int) -> int:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from atlantis_exp.faults import RunFault
 from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.preprocessing import Envs, Pixels
-from atlantis_exp.registry import SOURCES
+from atlantis_exp.registry import Game
 
 Rows = npt.NDArray[np.void]  # the last Step of each environment
 Calls = dict[int, tuple[Any, ...]]  # environment to the arguments of a call of its emulator
@@ -40,17 +40,17 @@ class Steps(NamedTuple):
     truncated: npt.NDArray[np.bool_]
     life_lost: npt.NDArray[np.bool_]
     frames: npt.NDArray[np.int64]
-    points: npt.NDArray[np.float64]  # (len(envs), sources), the rewards in the order of SOURCES
+    points: npt.NDArray[np.float64]  # (len(envs), sources), the rewards in the order of the game's sources
 
 
 class Emulators(ABC):
-    """Emulators of environments 0 to num_envs - 1; none begins an episode by itself.
+    """Emulators of environments 0 to num_envs - 1, all of one game; none begins an episode by itself.
 
     `envs` are distinct, by default all. Raises RuntimeError where anything but `receive` follows `send`.
     """
 
-    def __init__(self, num_envs: int, rows: Rows) -> None:
-        self.num_envs = num_envs
+    def __init__(self, num_envs: int, game: Game, rows: Rows) -> None:
+        self.num_envs, self.game = num_envs, game
         self._rows = rows
         self._sent: Envs | None = None
 
@@ -122,7 +122,7 @@ class SerialEmulators(Emulators):
 
     def __init__(self, make: Callable[[], Emulator], num_envs: int) -> None:
         self._emulators = {env: make() for env in range(num_envs)}
-        super().__init__(num_envs, np.empty(num_envs, _row(self._emulators[0].preprocessing.size)))
+        super().__init__(num_envs, self._emulators[0].game, np.empty(num_envs, _row(self._emulators[0])))
 
     def close(self) -> None:
         pass
@@ -143,10 +143,10 @@ class ProcessEmulators(Emulators):
     """
 
     def __init__(self, make: Callable[[], Emulator], num_envs: int, workers: int) -> None:
-        row = _row(make().preprocessing.size)  # and what `make` raises, it raises here
+        row = _row(first := make())  # and what `make` raises, it raises here
         context = multiprocessing.get_context("spawn")  # torch's threads make a fork unsafe
         memory = context.RawArray(c_ubyte, num_envs * row.itemsize)
-        super().__init__(num_envs, np.frombuffer(memoryview(memory), row))
+        super().__init__(num_envs, first.game, np.frombuffer(memoryview(memory), row))
         self._envs = [range(worker, num_envs, workers) for worker in range(workers)]
         self._connections: list[Connection[Any, Any]] = []
         self._processes: list[multiprocessing.context.SpawnProcess] = []
@@ -197,8 +197,9 @@ def make_emulators(make: Callable[[], Emulator], num_envs: int, workers: int) ->
     return ProcessEmulators(make, num_envs, min(workers, num_envs))
 
 
-def _row(size: int) -> np.dtype[np.void]:
-    formats = [(np.uint8, (size, size)), np.float64, np.bool_, np.bool_, np.bool_, np.int64, (np.float64, len(SOURCES))]
+def _row(emulator: Emulator) -> np.dtype[np.void]:
+    pixels, points = (emulator.preprocessing.size,) * 2, (len(emulator.game.sources),)
+    formats = [(np.uint8, pixels), np.float64, np.bool_, np.bool_, np.bool_, np.int64, (np.float64, points)]
     return np.dtype({"names": Steps._fields, "formats": formats}, align=True)
 
 

@@ -10,7 +10,6 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from atlantis_exp.registry import SOURCES
 from atlantis_exp.runs.files import ARTIFACT, read_file
 
 Array = npt.NDArray[np.float64]
@@ -27,7 +26,8 @@ class EpisodeTable:
     frames: Array  # (episodes,)
     truncated: Array  # (episodes,), 1 where the time cap ended it
     counts: Array  # steps, (episodes, actions, 2): chosen by the network, by chance
-    points: Array  # (episodes, sources), scores in the order of SOURCES; NaN where an older version did not record them
+    points: Array  # (episodes, sources), the scores' parts; NaN where an older version did not record them
+    sources: tuple[str, ...]  # what pays points
 
     def to_csv(self) -> str:
         """The table with a header; steps by action, those of them that chance chose, and points by source."""
@@ -35,7 +35,7 @@ class EpisodeTable:
         writer = csv.writer(text, lineterminator="\n")
         by_chance = [f"{action}_random" for action in self.actions]
         head = ("episode", "seed", "score", "steps", "frames", "truncated", "random", *self.actions, *by_chance)
-        writer.writerow((*head, *SOURCES))
+        writer.writerow((*head, *self.sources))
         for index, counts in enumerate(self.counts.astype(np.int64)):
             ends = (int(column[index]) for column in (self.steps, self.frames, self.truncated))
             row = (index, int(self.seeds[index]), float(self.scores[index]), *ends, int(counts[:, 1].sum()))
@@ -43,17 +43,17 @@ class EpisodeTable:
         return text.getvalue()
 
     @classmethod
-    def read(cls, path: Path) -> Self:
-        """The table in a file. Raises: ValueError, OSError."""
+    def read(cls, path: Path, sources: Sequence[str] = ()) -> Self:
+        """The table in a file, and of its points those of these sources. Raises: ValueError, OSError."""
         try:
             header, *lines = csv.reader(io.StringIO(read_file(path, ARTIFACT).decode(), newline=""), strict=True)
             rows = [dict(zip(header, line, strict=True)) for line in lines]
-            return cls._of(rows)
+            return cls._of(rows, sources)
         except (ValueError, KeyError, csv.Error) as error:
             raise ValueError(f"{path} is no table of episodes: {error}") from None
 
     @classmethod
-    def _of(cls, rows: Sequence[Mapping[str, str]]) -> Self:
+    def _of(cls, rows: Sequence[Mapping[str, str]], sources: Sequence[str]) -> Self:
         if not rows:
             raise ValueError("it has none")
         actions = tuple(name.removesuffix("_random") for name in rows[0] if name.endswith("_random"))
@@ -65,6 +65,6 @@ class EpisodeTable:
             np.array([float(row[name]) for row in rows]) for name in ("score", "steps", "frames", "truncated")
         )
         seeds = np.array([int(row["seed"]) for row in rows])
-        points = np.array([[float(row.get(source, "nan")) for source in SOURCES] for row in rows])
+        points = np.array([[float(row.get(source, "nan")) for source in sources] for row in rows])
         counts = np.stack((both - chance, chance), axis=2)
-        return cls(actions, seeds, scores, steps, frames, truncated, counts, points)
+        return cls(actions, seeds, scores, steps, frames, truncated, counts, points, tuple(sources))

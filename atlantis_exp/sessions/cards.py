@@ -150,9 +150,10 @@ def _page(folder: Path, card: Card, size: int, evaluation: Evaluation) -> str:
         **card.made,
     }
     place = folder if len(folder.parts) > 1 and not folder.is_absolute() else f"./{folder.name}"
+    what = f"{card.config.model.name} with {card.config.objective.name}"
     return f"""# {folder.name}
 
-Weights of a network that plays Atari Atlantis: {card.config.model.name} with {card.config.objective.name}.
+Weights of a network that plays Atari {card.config.env.title}: {what}.
 
     python -m atlantis_exp evaluate weights={place}               # plays the episodes below
     python -m atlantis_exp evaluate weights={place} episodes=1    # a first look

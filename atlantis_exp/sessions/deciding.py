@@ -20,7 +20,7 @@ from atlantis_exp.build import build_trainer
 from atlantis_exp.checking import digest, flatten, to_dict
 from atlantis_exp.comparison.comparing import compare
 from atlantis_exp.comparison.gather import resolve, values_in
-from atlantis_exp.comparison.published import literature
+from atlantis_exp.comparison.published import curves
 from atlantis_exp.comparison.tables import Comparison
 from atlantis_exp.comparison.verdict import Family, Group, Question, families, wanted
 from atlantis_exp.config import TrackingConfig
@@ -278,7 +278,9 @@ class _Session:
                 say(f"{label}: {duration(forecast)} a run, alone on this machine")
         if hours:
             say(f"at most {duration(hours)} where they run one after the other, evaluations not counted")
-        spread, whence = self._spread()
+        if (known := self._spread()) is None:
+            return
+        spread, whence = known
         for family in self.asked:
             pairs = len(family.plan.pairs(family.seeds))
             averaged = spread / sqrt(min(map(len, family.groups.values())))
@@ -298,8 +300,8 @@ class _Session:
             with trainer.emulators:
                 return expected(trainer, config, 0).hours
 
-    def _spread(self) -> tuple[float, str]:
-        """The standard deviation over seeds as a share of the score, and where that is known from."""
+    def _spread(self) -> tuple[float, str] | None:
+        """The standard deviation over seeds as a share of the score, and where that is known from; None if nowhere."""
         shares = []
         for label in self.contenders:
             ended = [RunFolder.of(self.job(label, seed).config).result for seed in range(self.looks[-1])]
@@ -310,7 +312,9 @@ class _Session:
                 shares.append(float(np.std(list(scores), ddof=1) / np.mean(list(scores))))
         if shares:
             return float(np.mean(shares)), "those that are there do"
-        rows = [row for row in literature("curves") if row["mean"] > 0]
+        rows = [row for row in curves(self._first.config.game) if row["mean"] > 0]
+        if not rows:
+            return None
         # Of five seeds the range is 2.326 standard deviations on average.
         published = [(row["high"] - row["low"]) / 2.326 / row["mean"] for row in rows]
         return float(np.median(published)), "published ones do (Dopamine's DQN, five seeds)"

@@ -9,7 +9,15 @@ from typing import Any
 from atlantis_exp import terminal
 from atlantis_exp.build import build_baseline, build_evaluator, build_network_actor, build_person
 from atlantis_exp.checking import digest, flatten, to_dict
-from atlantis_exp.config import BaselineAgentConfig, EnvConfig, EvaluationConfig, PathsConfig, TrackingConfig
+from atlantis_exp.components import facts_of
+from atlantis_exp.config import (
+    BaselineAgentConfig,
+    EnvConfig,
+    EvaluationConfig,
+    PathsConfig,
+    PluginConfig,
+    TrackingConfig,
+)
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour, score_histogram
 from atlantis_exp.runs.folder import BEST_EPISODE, EVALUATION, EVALUATION_REPORT, Result, RunFolder, find_run
@@ -82,6 +90,7 @@ def play_baseline(
     evaluation: EvaluationConfig,
     tracking: TrackingConfig,
     paths: PathsConfig,
+    plugins: Mapping[str, PluginConfig],
     name: str,
     title: str,
     command: str,
@@ -90,13 +99,14 @@ def play_baseline(
     outputs = Path(paths.outputs)
     catch_up(outputs)
     facts = {
+        **({"plugins": {key: to_dict(each) for key, each in plugins.items()}} if plugins else {}),
         "agent": to_dict(agent),
         "env": to_dict(env),
         "evaluation": to_dict(evaluation),
         "tracking": to_dict(tracking),
         "paths": to_dict(paths),
     }
-    played = _play(f"{agent.name} player on {env.id}", build_baseline(agent), env, evaluation)
+    played = _play(f"{agent.name} player on {env.id}", build_baseline(agent, env), env, evaluation)
     shown = labels(title, run_colour(agent.name), "baseline")
     _record(RunFolder(outputs / "runs" / name), facts, played, tracking, outputs, shown, command)
 
@@ -118,7 +128,7 @@ def play(
     outputs = Path(paths.outputs)
     catch_up(outputs)
     low, high = (env.frameskip, env.frameskip + 1) if isinstance(env.frameskip, int) else env.frameskip
-    window = Window(60 / ((low + high - 1) / 2), scale)  # steps a second, on average
+    window = Window(env.title, facts_of(env.game), 60 / ((low + high - 1) / 2), scale)  # steps a second, on average
     actor, emulators = build_person(env, window.choose)
     evaluator, progress = build_evaluator(env, evaluation), Progress()
     try:
@@ -171,7 +181,7 @@ def _record(
         for index, episode in enumerate(evaluation.episodes):
             journal.metrics({"score/episode": episode.score, "score/length": episode.steps}, index)
         scores = [episode.score for episode in evaluation.episodes]
-        journal.image("evaluation/histogram", score_histogram(scores, folder.name), step)
+        journal.image("evaluation/histogram", score_histogram(scores, folder.name, evaluation.game.score_range), step)
         journal.artifact(EVALUATION, evaluation.table().to_csv().encode())
         journal.artifact(EVALUATION_REPORT, evaluation.report().encode())
         if video is not None:

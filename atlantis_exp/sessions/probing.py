@@ -16,10 +16,10 @@ from atlantis_exp.comparison.comparing import Probed, slug
 from atlantis_exp.comparison.gather import Training
 from atlantis_exp.comparison.published import Row, Table
 from atlantis_exp.comparison.verdict import counted, scored
+from atlantis_exp.components import facts_of
 from atlantis_exp.config import EnvConfig
 from atlantis_exp.faults import Fault
 from atlantis_exp.game.archive import Archive, read_archive, rebuild
-from atlantis_exp.game.emulator import ACTIONS
 from atlantis_exp.game.preprocessing import Preprocessing
 from atlantis_exp.media import film, scene
 from atlantis_exp.runs.folder import RunFolder
@@ -64,8 +64,13 @@ def probe_groups(outputs: Path, groups: Mapping[str, Sequence[Training]], baseli
     Of more than four groups each is compared with one only: the first that the baseline names, or the first. A network
     that cannot be asked is named in a note; everything else goes on.
     """
-    archive, tell = read_archive(), _Teller()
+    tell = _Teller()
     notes: list[str] = []
+    archive = None
+    if (game := next(iter(groups.values()))[0].game) is not None and game.beside("states.npz").is_file():
+        archive = read_archive(game.beside("states.npz"))
+    else:
+        notes.append("There are no archived states of this game, so the networks were asked about none.")
     pairs = list(combinations(groups, 2))
     if len(groups) > _MOST_GROUPS:
         first = next((label for label in groups if baseline in (label, *label.split())), next(iter(groups)))
@@ -78,7 +83,8 @@ def probe_groups(outputs: Path, groups: Mapping[str, Sequence[Training]], baseli
         tell(f"reading the network of {run.name}")
         try:
             networks[label] = _network(label, RunFolder(outputs / "runs" / run.name))
-            values[label] = asked(networks[label], archive, tell)
+            if archive is not None:
+                values[label] = asked(networks[label], archive, tell)
         except (Fault, ValueError, OSError) as error:
             notes.append(f"The network of {label} was not asked about the archived states: {error}.")
     probes: Table = []
@@ -95,7 +101,7 @@ def probe_groups(outputs: Path, groups: Mapping[str, Sequence[Training]], baseli
                 films[row["film"]] = content
             partings.append(row)
             notes.append(_parting_in_words(row))
-    about = f"{len(archive.frames)} archived states, SHA-256 {archive.sha256}"
+    about = f"{len(archive.frames)} archived states, SHA-256 {archive.sha256}" if archive else "no archived states"
     return Probed({"probes": probes, "partings": partings}, films, notes, {"networks asked about": about})
 
 
@@ -129,7 +135,7 @@ def probed(one: Network, other: Network, values: Values, other_values: Values) -
     """How alike two networks judge the same states: actions, advantages, state values."""
     both = [values.astype(np.float64), other_values.astype(np.float64)]
     best, other_best = (each.argmax(axis=1) for each in both)
-    shares = [np.bincount(chosen, minlength=len(ACTIONS)) / len(chosen) for chosen in (best, other_best)]
+    shares = [np.bincount(chosen, minlength=values.shape[1]) / len(chosen) for chosen in (best, other_best)]
     equal = best == other_best
     clear = np.logical_and(*(_is_clear(each) for each in both))
     advantages = [_scaled(each - each.mean(axis=1, keepdims=True)) for each in both]
@@ -193,20 +199,21 @@ def part(one: Network, other: Network, tell: Tell = lambda _: None) -> tuple[Row
         row["outcome"] = f"never within {MOST_STEPS:,} steps"
         return row, None
     row |= {"step": step, "frame": sides[0].frame, "score": sides[0].score}
+    names = facts_of(one.env.game).actions
     for prefix, side in zip(("", "other_"), sides, strict=True):
         assert side.action is not None
         assert side.q_values is not None
-        row[f"{prefix}action"] = ACTIONS[side.action]
+        row[f"{prefix}action"] = names[side.action]
         # In all their digits: what parts two games may be a near tie.
         row[f"{prefix}values"] = ", ".join(
-            f"{action} {value!s}" for action, value in zip(ACTIONS, side.q_values, strict=True)
+            f"{action} {value!s}" for action, value in zip(names, side.q_values, strict=True)
         )
     filmed: list[tuple[int, Sides]] = []
     for now, sides in islice(chain(seen, moments), round(FILM_SECONDS * steps_a_second)):
         tell(f"{one.group} and {other.group}: they play on, step {now:,}")
         filmed.append((now, sides))
     row |= {"later_score": sides[0].score, "other_later_score": sides[1].score}
-    return row, film(_pictures((one.group, other.group), filmed, step, tell), steps_a_second)
+    return row, film(_pictures((one.group, other.group), names, filmed, step, tell), steps_a_second)
 
 
 def _side_by_side(one: Network, other: Network) -> Iterator[Sides]:
@@ -220,7 +227,7 @@ def _side_by_side(one: Network, other: Network) -> Iterator[Sides]:
 
 
 def _pictures(
-    groups: tuple[str, str], filmed: Sequence[tuple[int, Sides]], parted: int, tell: Tell
+    groups: tuple[str, str], names: Sequence[str], filmed: Sequence[tuple[int, Sides]], parted: int, tell: Tell
 ) -> Iterator[npt.NDArray[np.uint8]]:
     """The scenes of both games, side by side."""
     for step, sides in filmed:
@@ -229,7 +236,7 @@ def _pictures(
         for group, side in zip(groups, sides, strict=True):
             since = f"parted at {parted:,}" if step >= parted else "equal so far"
             lines = (group[:24], f"step {step:,}", f"score {side.score:,.0f}", since)
-            halves.append(scene(side.screen, lines, "network", ACTIONS, side.action, side.q_values))
+            halves.append(scene(side.screen, lines, "network", names, side.action, side.q_values))
         yield np.hstack(halves)
 
 

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from atlantis_exp.faults import Fault
+from atlantis_exp.registry import Game
 
 if TYPE_CHECKING:
     from atlantis_exp.game.preprocessing import Pixels
@@ -15,7 +16,7 @@ class Window:
         Fault: where pygame is not installed or there is no screen.
     """
 
-    def __init__(self, steps_per_second: float, scale: int) -> None:
+    def __init__(self, title: str, game: Game, steps_per_second: float, scale: int) -> None:
         try:
             import pygame
         except ImportError:
@@ -26,9 +27,10 @@ class Window:
             self._surface = pygame.display.set_mode((160 * scale, 210 * scale))
         except pygame.error as error:
             raise Fault(f"play needs a screen: {error}") from None
-        pygame.display.set_caption("Atlantis: left, up, right fire a gun each; a gun fires once a press")
-        # In the order of precedence: ALE's actions 3 LEFTFIRE, 2 RIGHTFIRE, 1 FIRE, which is the gun in the middle.
-        self._actions = {pygame.K_LEFT: 3, pygame.K_RIGHT: 2, pygame.K_UP: 1, pygame.K_SPACE: 1}
+        pygame.display.set_caption(f"{title}: {game.keys_in_words}")
+        self._actions = {  # in the order of precedence
+            pygame.key.key_code(key): game.actions.index(action) for key, action in game.keys if action in game.actions
+        }
         self._clock = pygame.time.Clock()
         self._steps_per_second = steps_per_second
         self.closed = False

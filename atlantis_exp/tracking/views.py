@@ -27,7 +27,7 @@ START, SWEEP = "start", "sweep"
 """The keys of the shared views, as `viewStateShareKey` in an address takes them."""
 
 _ABOUT = """\
-**Does network B play Atlantis better than network A, and how sure is that?**
+**Does network B play better than network A, and how sure is that?**
 
 - Two views are prepared (share key in the address): **Start here** has a line a run, the best evaluation first, and
   **Sweep** has a line a group of runs that differ only in their seed: their mean, with its range.

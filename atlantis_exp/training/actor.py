@@ -74,7 +74,7 @@ class PersonActor:
 
 @dataclass(frozen=True)
 class ConstantActor:
-    """Always the same action, whatever epsilon says: in Atlantis a held button fires once."""
+    """Always the same action, whatever epsilon says."""
 
     action: int
 

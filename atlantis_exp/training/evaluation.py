@@ -8,10 +8,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from atlantis_exp.game.emulator import ACTIONS
 from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.game.vector import Emulators
-from atlantis_exp.registry import SOURCES
+from atlantis_exp.registry import Game
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.statistics import Summary, summarize
 from atlantis_exp.training.actor import Actor
@@ -35,7 +34,7 @@ class Episode:
     random: bytearray = field(default_factory=bytearray)  # 1 where chance chose
     rewards: "array[float]" = field(default_factory=lambda: array("f"))  # one a step
     raw_values: bytearray = field(default_factory=bytearray)  # of `values`
-    points: list[float] = field(default_factory=lambda: [0.0] * len(SOURCES))  # the score in the order of SOURCES
+    points: list[float] = field(default_factory=list)  # the score, in the order of the game's sources
 
     @property
     def steps(self) -> int:
@@ -45,18 +44,16 @@ class Episode:
     @property
     def values(self) -> npt.NDArray[np.float32] | None:
         """What the network thought of each action before every step, (steps, actions); None if it was not asked."""
-        values = np.frombuffer(self.raw_values, np.float32).reshape(-1, len(ACTIONS))
-        return values if values.size else None
+        return np.frombuffer(self.raw_values, np.float32).reshape(self.steps, -1) if self.raw_values else None
 
     @property
     def random_share(self) -> float:
         """Share of the decisions that chance took."""
         return sum(self.random) / self.steps
 
-    @property
-    def action_counts(self) -> npt.NDArray[np.int64]:
+    def action_counts(self, num_actions: int) -> npt.NDArray[np.int64]:
         """How often each action was chosen, (actions, 2): by the network, by chance."""
-        counts = np.zeros((len(ACTIONS), 2), np.int64)
+        counts = np.zeros((num_actions, 2), np.int64)
         np.add.at(counts, (np.frombuffer(self.actions, np.uint8), np.frombuffer(self.random, np.uint8)), 1)
         return counts
 
@@ -67,6 +64,7 @@ class Evaluation:
 
     epsilon: float
     episodes: list[Episode]
+    game: Game
 
     @cached_property
     def summary(self) -> Summary:
@@ -81,8 +79,13 @@ class Evaluation:
     @cached_property
     def action_counts(self) -> npt.NDArray[np.int64]:
         """Those of all episodes together, (actions, 2): by the network, by chance."""
-        counts: npt.NDArray[np.int64] = np.sum([episode.action_counts for episode in self.episodes], axis=0)
+        counts: npt.NDArray[np.int64] = self._action_counts.sum(axis=0)
         return counts
+
+    @cached_property
+    def _action_counts(self) -> npt.NDArray[np.int64]:
+        """Those of each episode, (episodes, actions, 2)."""
+        return np.array([episode.action_counts(len(self.game.actions)) for episode in self.episodes])
 
     @property
     def random_share(self) -> float:
@@ -104,11 +107,11 @@ class Evaluation:
     def favourite(self) -> tuple[str, float]:
         """The action that the network chose most often, and its share of the network's decisions; 0 if it had none."""
         chosen = self.action_counts[:, 0]
-        return ACTIONS[int(chosen.argmax())], float(chosen.max() / max(1, chosen.sum()))
+        return self.game.actions[int(chosen.argmax())], float(chosen.max() / max(1, chosen.sum()))
 
     @property
     def collapsed(self) -> bool:
-        """Whether the network chooses one action only, which scores 2,000 when held: a press fires once."""
+        """Whether the network chooses one action only."""
         return self.favourite[1] > _COLLAPSED
 
     @property
@@ -141,13 +144,13 @@ class Evaluation:
             "actions/network_share": 1 - self.random_share,
             "actions/random_share_best": self.best.random_share,
             "actions/network_share_best": 1 - self.best.random_share,
-            **{f"actions/{action}": float(share) for action, share in zip(ACTIONS, shares, strict=True)},
-            "actions/entropy": float(-sum(share * np.log2(share) for share in shares if share)),  # bits; at most 2
+            **{f"actions/{action}": float(share) for action, share in zip(self.game.actions, shares, strict=True)},
+            "actions/entropy": float(-sum(share * np.log2(share) for share in shares if share)),  # bits
             "actions/favourite_share": self.favourite[1],
             **({} if agreement is None else {"actions/random_equals_best": agreement}),
             **{
                 f"evaluation/score_{source}": float(np.mean([episode.points[index] for episode in self.episodes]))
-                for index, source in enumerate(SOURCES)
+                for index, source in enumerate(self.game.sources)
             },
         }
 
@@ -156,13 +159,14 @@ class Evaluation:
         columns = ("seed", "score", "steps", "frames", "truncated")
         values = {name: np.array([getattr(episode, name) for episode in self.episodes]) for name in columns}
         return EpisodeTable(
-            actions=ACTIONS,
+            actions=self.game.actions,
+            sources=self.game.sources,
             seeds=values["seed"],
             scores=values["score"].astype(np.float64),
             steps=values["steps"].astype(np.float64),
             frames=values["frames"].astype(np.float64),
             truncated=values["truncated"].astype(np.float64),
-            counts=np.array([episode.action_counts for episode in self.episodes], np.float64),
+            counts=self._action_counts.astype(np.float64),
             points=np.array([episode.points for episode in self.episodes], np.float64),
         )
 
@@ -198,7 +202,11 @@ def evaluate(
     Raises:
         Stopped: when `stop`, which is asked before every step, says so.
     """
-    played = [Episode(_seed_sequence(seed, index).generate_state(1).item()) for index in range(episodes)]
+    game = emulators.game
+    played = [
+        Episode(_seed_sequence(seed, index).generate_state(1).item(), points=[0.0] * len(game.sources))
+        for index in range(episodes)
+    ]
     streams = [np.random.default_rng(_seed_sequence(seed, index).spawn(1)[0]) for index in range(episodes)]
     stacks = FrameStack(emulators.num_envs, size, stack)
     waiting = iter(range(episodes))
@@ -241,7 +249,7 @@ def evaluate(
                 over += 1
                 begin(env)
         on_step(played, over)
-    return Evaluation(epsilon, played)
+    return Evaluation(epsilon, played, game)
 
 
 def _seed_sequence(seed: int, index: int) -> np.random.SeedSequence:

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from atlantis_exp.game.emulator import ACTIONS, Emulator
+from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.media import film, scene
 from atlantis_exp.training.actor import States
@@ -93,6 +93,6 @@ def film_episode(
                 f"score {moment.score:,.0f} of {episode.score:,.0f}",
             )
             source = "random" if moment.random else chooser
-            yield scene(moment.screen, lines, source, ACTIONS, moment.action, moment.q_values)
+            yield scene(moment.screen, lines, source, emulator.game.actions, moment.action, moment.q_values)
 
     return film(pictures(), 60 * episode.steps / episode.frames)

@@ -14,7 +14,6 @@ import psutil
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.training.trainer import Trainer
 
-_EPISODE_STEPS = 2_000  # of a random player in `Atlantis-v0`; a good one plays many times longer
 _WARM_MEMORY = 512 * 2**20  # bytes that torch and its thread buffers grow by once they work
 
 
@@ -81,7 +80,7 @@ def forecast(
     sampler = copy.deepcopy(plan.phases[0].sampler)
 
     def play() -> None:
-        actions = rng.integers(4, size=num_envs)
+        actions = rng.integers(len(emulators.game.actions), size=num_envs)
         steps = emulators.step(actions)
         for env in range(num_envs):
             memory.add(env, int(actions[env]), float(steps.rewards[env]), steps.observations[env], False)
@@ -97,7 +96,7 @@ def forecast(
         update_seconds = _median_seconds(update, at_least=3, seconds=1.0)
     emulators.reset(range(num_envs), [0] * num_envs)  # a console that has not played
 
-    length = plan.length * (1 if plan.unit == "steps" else _EPISODE_STEPS)
+    length = plan.length * (1 if plan.unit == "steps" else emulators.game.episode_steps)
     epsilon = statistics.fmean(plan.epsilon(progress, int(progress * length)) for progress in np.linspace(0, 1, 101))
     acts = 1 - epsilon**num_envs  # share of the iterations in which any environment asks the network
     seconds_a_step = (play_seconds + acts * act_seconds) / num_envs + update_seconds / plan.learn_every
@@ -105,7 +104,7 @@ def forecast(
     stored = min(capacity, steps_done + steps)
     replay_bytes = min(max_bytes, stored * memory.nbytes // memory.next_id)
     weights = sum(tensor.nbytes for tensor in learner.network.state_dict().values())
-    evaluations = 1 + evaluations_an_episode * steps / _EPISODE_STEPS
+    evaluations = 1 + evaluations_an_episode * steps / emulators.game.episode_steps
     return Forecast(
         steps_per_second=1 / seconds_a_step,
         steps=steps,

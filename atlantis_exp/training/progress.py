@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from math import isnan
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +15,6 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 
 from atlantis_exp import terminal
-from atlantis_exp.statistics import EARLY_FRAMES, RANDOM_SCORE
 
 if TYPE_CHECKING:
     from atlantis_exp.training.evaluation import Episode, Evaluation
@@ -125,18 +125,19 @@ class Progress:
 
     def evaluated(self, step: int, frames: int, evaluation: "Evaluation") -> None:
         """To be called after every evaluation of a training, with the steps and frames that it has trained for."""
-        summary = evaluation.summary
+        summary, game = evaluation.summary, evaluation.game
         self.say(
             f"step {step:,}, {summary.episodes} episodes evaluated at epsilon {evaluation.epsilon}: "
             f"mean {summary.mean:,.0f} +- {summary.standard_error:,.0f}, high {summary.high:,.0f}, "
             f"low {summary.low:,.0f}, interquartile mean {summary.interquartile_mean:,.0f}"
         )
         if evaluation.collapsed:
-            self.say(f"warning: the policy has {evaluation.policy}; any one action, held, scores 2,000")
-        if summary.mean < RANDOM_SCORE and frames <= EARLY_FRAMES:
+            held = "" if isnan(game.held_score) else f"; any one action, held, scores {game.held_score:,.0f}"
+            self.say(f"warning: the policy has {evaluation.policy}{held}")
+        if summary.mean < game.random_score and frames <= game.early_frames:
             self.say(
-                f"  below the published random player's {RANDOM_SCORE:,.0f}, which is normal here: "
-                f"at 5 M frames published DQN is at 7,000 to 9,000 (docs/comparison.md)"
+                f"  below the published random player's {game.random_score:,.0f}, which is normal here: "
+                f"{game.early_scores}"
             )
 
     def _is_time_for_a_line(self) -> bool:

@@ -47,6 +47,7 @@ class Diverged(Fault):
 class Recorder:
     """Tells a tracker and a person how a training goes; has a state of its own, and changes nobody else's.
 
+    score_range: the axis of the pictures of scores.
     about: markdown that opens the run's description: what it is and how to continue it.
     """
 
@@ -61,11 +62,12 @@ class Recorder:
         progress: Progress,
         evaluate: Evaluate,
         film: Film,
+        score_range: tuple[float, float],
         about: str = "",
     ) -> None:
         self.plan, self.cadence, self.learner, self.memory = plan, cadence, learner, memory
         self.tracker, self.progress, self._evaluate, self._film = tracker, progress, evaluate, film
-        self.about = about
+        self.score_range, self.about = score_range, about
         self.episodes: list[Played] = []
         self.best_mean = -np.inf  # of all evaluations
         self.best_step = -1
@@ -99,9 +101,10 @@ class Recorder:
             title = f"training, episodes {played.episode - len(window) + 1}-{played.episode}"
             # A slider that counts windows, not steps: at each of its positions every run has a picture.
             number = played.episode // self.cadence.histogram_episodes - 1
-            self.tracker.image("score/histogram", score_histogram(window, title), number)
+            self.tracker.image("score/histogram", score_histogram(window, title, self.score_range), number)
             ends = [each.episode if self.plan.unit == "episodes" else each.step for each in self.episodes]
-            picture = score_heatmap(ends, self.recent_scores(played.episode), self.plan.length, self.plan.unit)
+            scores, plan = self.recent_scores(played.episode), self.plan
+            picture = score_heatmap(ends, scores, plan.length, plan.unit, self.score_range)
             self.tracker.image("score/heatmap", picture, number)
 
     def curves(self, counters: Counters) -> None:
@@ -175,7 +178,7 @@ class Recorder:
         self.tracker.tags({"policy": evaluation.policy})
         scores = [episode.score for episode in evaluation.episodes]
         title = f"evaluation, step {step:,}"
-        self.tracker.image("evaluation/histogram", score_histogram(scores, title), self.evaluations)
+        self.tracker.image("evaluation/histogram", score_histogram(scores, title, self.score_range), self.evaluations)
         self.evaluations += 1
         table = evaluation_at(step)
         self.tracker.artifact(table, evaluation.table().to_csv().encode())

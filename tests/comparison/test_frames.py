@@ -6,6 +6,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +17,15 @@ from atlantis_exp import load_runs
 from atlantis_exp.checking import to_dict
 from atlantis_exp.comparison.export_tables import UNITS
 from atlantis_exp.comparison.gather import gather
+from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
-from atlantis_exp.registry import SOURCES
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.statistics import summarize
 from atlantis_exp.training.evaluation import Episode, Evaluation
 
 Recorded = Callable[..., Path]
+ATLANTIS = facts_of(game_of("Atlantis-v0"))
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "notebooks.md"
 
 
@@ -32,7 +34,7 @@ def episodes(*scores: float) -> Evaluation:
     played = [
         Episode(seed, score, 9, False, bytearray([1, 1, 1]), bytearray([0, 0, 1])) for seed, score in enumerate(scores)
     ]
-    return Evaluation(0.05, played)
+    return Evaluation(0.05, played, replace(ATLANTIS, sources=()))
 
 
 def tag(folder: Path, *values: dict[str, str]) -> None:
@@ -97,7 +99,7 @@ def test_an_evaluation_is_a_row_of_what_its_episodes_say(recorded: Recorded, tmp
     assert (row["low"], row["high"], row["standard_error"]) == (1_000, 9_000, summary.standard_error)
     assert row["points_per_frame"] == sum(scores) / (4 * 12)
     assert (row["steps_mean"], row["truncated_share"], row["random_share"]) == (4, 0.25, 0.25)
-    assert [row[source] for source in SOURCES] == [0, 3_750 / 4, 0, 0, 3_750 * 3 / 4]
+    assert [row[source] for source in ATLANTIS.sources] == [0, 3_750 / 4, 0, 0, 3_750 * 3 / 4]
 
 
 def test_an_episode_is_a_row_with_the_evaluation_that_it_is_of(recorded: Recorded, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 from atlantis_exp.comparison.gather import gather, group, refuse_mixed_protocols, select
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
+from atlantis_exp.registry import Game
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.training.evaluation import Episode, Evaluation
 
@@ -24,7 +25,10 @@ def evaluated(outputs: Path, run: Path, score: float, epsilon: float, step: int 
     facts = {"run": run.name, "step": step, "evaluation": {"epsilon": epsilon}}
     (folder / "config.json").write_text(json.dumps(facts))
     episode = Episode(0, score, 9, False, bytearray([1, 1, 1]), bytearray([0, 0, 1]))
-    journal.artifact("evaluation/episodes.csv", Evaluation(epsilon, [episode]).table().to_csv().encode())
+    journal.artifact(
+        "evaluation/episodes.csv",
+        Evaluation(epsilon, [episode], Game(actions=("NOOP", "FIRE"))).table().to_csv().encode(),
+    )
     journal.finish()
     (folder / "result.json").write_text("{}")
     return folder

@@ -14,14 +14,14 @@ import scipy.stats
 
 from atlantis_exp.comparison.figures import draw
 from atlantis_exp.comparison.gather import gather, group
-from atlantis_exp.comparison.published import early_dqn, literature
+from atlantis_exp.comparison.published import curves, early_dqn, scores
 from atlantis_exp.comparison.report import cells
 from atlantis_exp.comparison.tables import Comparison, compare, to_csv
 from atlantis_exp.comparison.verdict import Question
+from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.preprocessing import Preprocessing
 from atlantis_exp.game.vector import make_emulators
-from atlantis_exp.registry import SOURCES
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.folder import evaluation_at
 from atlantis_exp.training.actor import RandomActor
@@ -34,6 +34,9 @@ GOOD = (
     (5_000.0, 5_100.0, 5_200.0, 5_300.0),
 )
 BAD = ((3_000.0, 3_300.0, 3_400.0, 3_600.0), (3_100.0, 3_200.0, 3_400.0, 3_700.0), (3_000.0, 3_100.0, 3_500.0, 3_600.0))
+
+ATLANTIS = game_of("Atlantis-v0")
+SOURCES = facts_of(ATLANTIS).sources
 
 
 @pytest.fixture
@@ -232,22 +235,25 @@ def test_the_time_cap_is_named_where_it_decides(compared: Callable[..., Comparis
 
 
 def test_early_scores_below_random_come_with_the_reason(compared: Callable[..., Comparison]) -> None:
-    assert early_dqn() in compared().notes
-    assert "At 5 M frames published DQN scores 7,433 to 8,341, below the random player's 12,850" in early_dqn()
+    assert early_dqn(ATLANTIS) in compared().notes
+    assert "At 5 M frames published DQN scores 7,433 to 8,341, below the random player's 12,850" in early_dqn(ATLANTIS)
 
 
 def test_a_late_curve_has_the_published_ones_beside_it_and_no_excuse(compared: Callable[..., Comparison]) -> None:
     comparison = compared(curve=((0, 0, 0, 0), (12_000_000, 9, 9, 9_000)))
-    assert early_dqn() not in comparison.notes
+    assert early_dqn(ATLANTIS) not in comparison.notes
     assert {row["frames"] for row in comparison.tables["published_curves"]} == {1e6 * n for n in range(1, 11)}
 
 
 def test_what_is_published_has_a_protocol_and_a_source() -> None:
-    scores = {row["name"]: row for row in literature("scores")}
-    assert all(row["protocol"] and row["source"] and row["kind"] in ("player", "algorithm") for row in scores.values())
-    assert scores["random player"]["score"] == 12_850
-    assert scores["GDI-H3"]["score"] == 3_837_300
-    assert all(row["source"] and row["seeds"] == 5 for row in literature("curves"))
+    rows = scores(ATLANTIS)
+    published = {row["name"]: row for row in rows}
+    assert all(
+        row["protocol"] and row["source"] and row["kind"] in ("player", "algorithm") for row in published.values()
+    )
+    assert published["random player"]["score"] == 12_850
+    assert published["GDI-H3"]["score"] == 3_837_300
+    assert all(row["source"] and row["seeds"] == 5 for row in curves(ATLANTIS))
 
 
 def test_a_table_survives_csv(compared: Callable[..., Comparison]) -> None:

@@ -60,7 +60,8 @@ def of(model: str, seed: int, scores: Sequence[float], sampler: str = "uniform",
         frames,
         np.zeros(size),
         np.ones((size, 1, 2)),
-        np.full((size, 5), np.nan),
+        np.empty((size, 0)),
+        (),
     )
     facts: dict[str, Any] = {"tags": {}, "policy": "", **changes}
     science = {key: value for key, value in config.items() if key != "budget.steps"}

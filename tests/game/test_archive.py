@@ -6,22 +6,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.game import archive
 from atlantis_exp.game.archive import FRAMES, read_archive, rebuild
 from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.preprocessing import PALETTE, FrameStack, Preprocessing
 
+GAME = facts_of(game_of("Atlantis-v0"))
+STATES = Path(archive.__file__).with_name("atlantis_states.npz")
 SHA256 = "e94febf5cb2efab959fd5658e101ab752fd0b33cae2649494ba6ed3c73148a04"
 
 
 def test_the_archive_is_the_one_that_ships_and_small() -> None:
-    content = (Path(archive.__file__).parent / "states.npz").read_bytes()
-    assert hashlib.sha256(content).hexdigest() == SHA256 == read_archive().sha256
+    content = STATES.read_bytes()
+    assert hashlib.sha256(content).hexdigest() == SHA256 == read_archive(STATES).sha256
     assert len(content) < 1_500_000
 
 
 def test_it_has_early_and_late_moments_of_three_players_and_no_two_alike() -> None:
-    states = read_archive()
+    states = read_archive(STATES)
     assert states.frames.shape == (128, FRAMES, 210, 160)
     assert {name: states.players.count(name) for name in states.players} == {
         "cnn_fast": 48,
@@ -51,8 +54,8 @@ def test_a_state_rebuilt_of_frames_is_the_emulators_bit_for_bit(
     """Two emulators play the same game, one in steps and one frame by frame."""
     preprocessing = Preprocessing(size, crop)
     settings = {"sticky": 0.25, "max_frames": 10_000, "max_steps": None, "noop_max": 0}
-    player = Emulator(preprocessing=preprocessing, frameskip=frameskip, max_pool=max_pool, **settings)  # type: ignore[arg-type]
-    watcher = Emulator(preprocessing=preprocessing, frameskip=1, max_pool=False, **settings)  # type: ignore[arg-type]
+    player = Emulator(game=GAME, preprocessing=preprocessing, frameskip=frameskip, max_pool=max_pool, **settings)  # type: ignore[arg-type]
+    watcher = Emulator(game=GAME, preprocessing=preprocessing, frameskip=1, max_pool=False, **settings)  # type: ignore[arg-type]
     stacks = FrameStack(1, size, stack)
     stacks.reset([0], player.reset(7)[np.newaxis])
     watcher.reset(7)
@@ -74,6 +77,6 @@ def test_a_state_rebuilt_of_frames_is_the_emulators_bit_for_bit(
 
 
 def test_a_state_that_needs_more_frames_is_refused() -> None:
-    frames = read_archive().frames[0]
+    frames = read_archive(STATES).frames[0]
     with pytest.raises(ValueError, match="8 observations that are 5 frames apart need 37 frames"):
         rebuild(frames, Preprocessing(84, (0, 160, 210, 0)), 5, 8, True)

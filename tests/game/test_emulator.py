@@ -12,17 +12,21 @@ from ale_py import ALEInterface
 from ale_py.roms import get_rom_path
 from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 
-from atlantis_exp.game.emulator import ACTIONS, Emulator, Step, query_environment
+from atlantis_exp.build import build_game
+from atlantis_exp.components import known
+from atlantis_exp.game.emulator import Emulator, Step, query_environment
 from atlantis_exp.game.preprocessing import FrameStack, Preprocessing
-from atlantis_exp.registry import SOURCES
 
 Pixels = npt.NDArray[np.uint8]
+
+ATLANTIS = build_game(known("env")["atlantis"])
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date:DeprecationWarning")
 
 
 def emulator(**changes: Any) -> Emulator:
     settings: dict[str, Any] = {
+        "game": ATLANTIS,
         "preprocessing": Preprocessing(84, (0, 160, 210, 0)),
         "frameskip": 4,
         "sticky": 0.25,
@@ -146,10 +150,10 @@ def test_no_points_are_of_a_gun_that_never_fires_and_a_bonus_is_500_a_building(
     """So what two or four buildings pay is told from what a bomber pays, which is the same."""
     ours, rng = emulator(), np.random.default_rng(seed)
     ours.reset(seed)
-    totals, paid, step = dict.fromkeys(SOURCES, 0.0), set(), None
+    totals, paid, step = dict.fromkeys(ATLANTIS.sources, 0.0), set(), None
     while step is None or not step.terminated:
         step = ours.step(int(rng.choice(actions)))
-        points = dict(zip(SOURCES, step.points, strict=True))
+        points = dict(zip(ATLANTIS.sources, step.points, strict=True))
         assert sum(points.values()) == step.reward
         if bonus := points["wave_bonus"]:
             assert bonus == step.reward == 500 * (ours.lives + 1)  # ALE does not count the last building
@@ -171,7 +175,7 @@ def test_actions_are_the_minimal_set_of_ale() -> None:
     path = get_rom_path("atlantis")
     assert path is not None
     ale.loadROM(path)
-    assert tuple(action.name for action in ale.getMinimalActionSet()) == ACTIONS
+    assert tuple(action.name for action in ale.getMinimalActionSet()) == ATLANTIS.actions
 
 
 def test_max_steps_truncate_every_episode_anew() -> None:
@@ -284,9 +288,11 @@ def test_a_pool_restored_before_an_unfinished_step_is_the_one_saved() -> None:
 
 def test_it_is_silent() -> None:
     code = (
+        "from atlantis_exp.components import facts_of, game_of\n"
         "from atlantis_exp.game.emulator import Emulator\n"
         "from atlantis_exp.game.preprocessing import Preprocessing\n"
         "game = Emulator(preprocessing=Preprocessing(84, (0, 160, 210, 0)), frameskip=4, sticky=0.25,\n"
+        "                game=facts_of(game_of('Atlantis-v0')),\n"
         "                max_frames=1_000, max_steps=None, noop_max=0, max_pool=False)\n"
         "game.reset(seed=1)\n"
         "game.load_state_dict(game.state_dict())\n"

@@ -12,12 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from atlantis_exp.build import build_game
+from atlantis_exp.components import known
 from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.preprocessing import Pixels, Preprocessing
 from atlantis_exp.game.vector import Emulators, ProcessEmulators, SerialEmulators, Steps, WorkerDied, make_emulators
 
+ATLANTIS = build_game(known("env")["atlantis"])
 make = functools.partial(
     Emulator,
+    game=ATLANTIS,
     preprocessing=Preprocessing(32, (14, 160, 94, 0)),
     frameskip=(2, 5),
     sticky=0.25,
@@ -208,12 +212,14 @@ def test_workers_leave_signals_to_the_parent(two_workers: ProcessEmulators) -> N
 
 PARENT = """
 import functools, multiprocessing, sys
+from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.preprocessing import Preprocessing
 from atlantis_exp.game.vector import ProcessEmulators
 
 make = functools.partial(Emulator, preprocessing=Preprocessing(84, (0, 160, 210, 0)), frameskip=4, sticky=0.25,
-                         max_frames=1_000, max_steps=None, noop_max=0, max_pool=False)
+                         max_frames=1_000, max_steps=None, noop_max=0, max_pool=False,
+                         game=facts_of(game_of("Atlantis-v0")))
 emulators = ProcessEmulators(make, 2, 2)
 emulators.reset([0, 1])
 print(*[child.pid for child in multiprocessing.active_children()], flush=True)
@@ -252,11 +258,11 @@ def test_a_parent_that_forgets_to_close_ends_in_silence() -> None:
 
 
 def test_workers_import_nothing_but_this_wing_what_a_fault_is_and_what_pays_points() -> None:
-    code = "import sys, atlantis_exp.game.vector; print(*sys.modules)"
+    code = "import sys, atlantis_exp.game.atlantis, atlantis_exp.game.vector; print(*sys.modules)"
     modules = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True).stdout.split()
     ours = {name for name in modules if name.startswith("atlantis_exp.")}
     assert ours == {"atlantis_exp.game", "atlantis_exp.faults", "atlantis_exp.registry"} | {
-        f"atlantis_exp.game.{room}" for room in ("preprocessing", "emulator", "vector")
+        f"atlantis_exp.game.{room}" for room in ("atlantis", "preprocessing", "emulator", "vector")
     }
     assert not {"torch", "mlflow", "hydra", "omegaconf", "matplotlib"} & set(modules)
 

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.training.evaluation import Episode, Evaluation
 
@@ -26,7 +27,9 @@ EVALUATION = Evaluation(
         Episode(1, 300.0, 12, False, bytearray([0, 1, 1, 3]), bytearray([1, 0, 0, 0]), points=[100, 200, 0, 0, 0]),
         Episode(2**32 - 1, 900.0, 6, True, bytearray([3, 3]), bytearray([1, 0]), points=[0, 400, 0, 0, 500]),
     ],
+    facts_of(game_of("Atlantis-v0")),
 )
+SOURCES = EVALUATION.game.sources
 
 episodes = st.tuples(
     st.integers(0, 2**32 - 1),  # seed
@@ -39,8 +42,8 @@ episodes = st.tuples(
 
 
 def assert_equal(one: EpisodeTable, other: EpisodeTable) -> None:
-    assert one.actions == other.actions
-    for name in (field.name for field in fields(EpisodeTable) if field.name != "actions"):
+    assert (one.actions, one.sources) == (other.actions, other.sources)
+    for name in (field.name for field in fields(EpisodeTable) if field.name not in ("actions", "sources")):
         ours, theirs = getattr(one, name), getattr(other, name)
         assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape), name
         assert np.array_equal(ours, theirs, equal_nan=True), name
@@ -52,7 +55,7 @@ def test_the_table_of_an_evaluation_is_the_text_that_stored_runs_have() -> None:
 
 def test_a_stored_table_is_read(tmp_path: Path) -> None:
     (tmp_path / "episodes.csv").write_text(GOLDEN)
-    table = EpisodeTable.read(tmp_path / "episodes.csv")
+    table = EpisodeTable.read(tmp_path / "episodes.csv", SOURCES)
     assert_equal(table, EVALUATION.table())
     assert table.actions == ("NOOP", "FIRE", "RIGHTFIRE", "LEFTFIRE")
     assert table.seeds.tolist() == [1, 2**32 - 1]
@@ -62,12 +65,12 @@ def test_a_stored_table_is_read(tmp_path: Path) -> None:
 
 def test_a_table_stored_without_points_is_read_and_their_split_is_not_known(tmp_path: Path) -> None:
     (tmp_path / "episodes.csv").write_text(WITHOUT_POINTS)
-    table = EpisodeTable.read(tmp_path / "episodes.csv")
+    table = EpisodeTable.read(tmp_path / "episodes.csv", SOURCES)
     assert table.points.shape == (2, 5)
     assert np.isnan(table.points).all()
     assert_equal(replace(table, points=EVALUATION.table().points), EVALUATION.table())
     (tmp_path / "episodes.csv").write_text(table.to_csv())
-    assert_equal(EpisodeTable.read(tmp_path / "episodes.csv"), table)
+    assert_equal(EpisodeTable.read(tmp_path / "episodes.csv", SOURCES), table)
 
 
 @given(st.lists(episodes, min_size=1, max_size=5))
@@ -84,11 +87,12 @@ def test_writing_and_reading_are_inverse(
         truncated=np.array([row[3] for row in rows], np.float64),
         counts=counts,
         points=np.array([row[5] for row in rows], np.float64),
+        sources=SOURCES,
     )
     with TemporaryDirectory() as folder:
         path = Path(folder, "episodes.csv")
         path.write_text(table.to_csv())
-        again = EpisodeTable.read(path)
+        again = EpisodeTable.read(path, SOURCES)
     assert_equal(again, table)
     assert again.to_csv() == table.to_csv()
 
@@ -105,4 +109,4 @@ def test_writing_and_reading_are_inverse(
 def test_what_is_no_table_is_refused(tmp_path: Path, text: str, fault: str) -> None:
     (tmp_path / "episodes.csv").write_text(text)
     with pytest.raises(ValueError, match=fault):
-        EpisodeTable.read(tmp_path / "episodes.csv")
+        EpisodeTable.read(tmp_path / "episodes.csv", SOURCES)

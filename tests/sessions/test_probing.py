@@ -18,9 +18,9 @@ import safetensors.numpy
 from atlantis_exp.build import make_emulator
 from atlantis_exp.comparison.export_tables import to_latex, to_parquet, with_units
 from atlantis_exp.comparison.gather import Training, gather
+from atlantis_exp.components import facts_of, known
 from atlantis_exp.config import Config
 from atlantis_exp.game.archive import read_archive
-from atlantis_exp.game.emulator import ACTIONS
 from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.sessions import probing
@@ -34,6 +34,9 @@ pytestmark = pytest.mark.slow
 
 Compose = Callable[..., Config]
 PRETRAINED = Path(__file__).resolve().parents[2] / "pretrained"
+GAME = known("env")["atlantis"]
+ATLANTIS = facts_of(GAME)
+STATES = GAME.beside("states.npz")
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +136,7 @@ def test_a_network_agrees_with_itself_and_never_parts(trained: list[Training], f
     (row,) = result.tables["partings"]
     assert row["outcome"] == "never, a game was over after 40 steps"
     assert result.films == {}
-    assert result.facts == {"networks asked about": f"128 archived states, SHA-256 {read_archive().sha256}"}
+    assert result.facts == {"networks asked about": f"128 archived states, SHA-256 {read_archive(STATES).sha256}"}
 
 
 def test_the_same_runs_give_the_same_tables_words_and_films(trained: list[Training], folder: Path) -> None:
@@ -167,7 +170,7 @@ def test_networks_part_where_a_naive_loop_finds_it(
     found = naive(networks, 200)
     assert (found.step > 5) == (which == "nearly_alike")
     assert (row["outcome"], row["step"], row["frame"], row["score"]) == ("parted", *found[:3])
-    assert [row["action"], row["other_action"]] == [ACTIONS[action] for action in found.actions]
+    assert [row["action"], row["other_action"]] == [ATLANTIS.actions[action] for action in found.actions]
     for name in ("", "other_"):
         values = {text.split()[0]: float(text.split()[1]) for text in row[f"{name}values"].split(", ")}
         assert max(values, key=lambda action: values[action]) == row[f"{name}action"]
@@ -210,7 +213,7 @@ def test_scales_of_values_do_not_count_but_signs_do(unlike: tuple[Network, Netwo
 
 
 def test_the_asked_states_are_what_each_network_sees(unlike: tuple[Network, Network]) -> None:
-    states = read_archive()
+    states = read_archive(STATES)
     few = states._replace(frames=states.frames[:20])
     values, other_values = (asked(network, few) for network in unlike)
     assert values.shape == other_values.shape == (20, 4)
@@ -229,9 +232,9 @@ def test_the_run_of_the_median_score_speaks_for_a_group(recorded: Callable[..., 
 def test_of_many_groups_each_is_compared_with_one(
     trained: list[Training], folder: Path, monkeypatch: pytest.MonkeyPatch, baseline: str | None, first: str
 ) -> None:
-    archive = read_archive()
+    archive = read_archive(STATES)
     few = archive._replace(frames=archive.frames[:4])
-    monkeypatch.setattr(probing, "read_archive", lambda: few)
+    monkeypatch.setattr(probing, "read_archive", lambda _: few)
     groups = {f"{letter} x": [trained[0]] for letter in "abcde"}
     result = probe_groups(folder, groups, baseline)
     others = [label for label in groups if label != first]
@@ -264,7 +267,7 @@ def test_compare_asks_why_and_keeps_page_tables_and_films(
     assert text.count(" was not asked about the archived states: ") == 2
     assert "8 observations that are 6 frames apart need 43 frames." in text
     assert "has neither a checkpoint nor an evaluation yet." in text
-    assert read_archive().sha256 in text
+    assert read_archive(STATES).sha256 in text
     sources = re.findall(r'<video controls preload="metadata" src="([^"]*)"', text)
     assert sources == [row["film"] for row in partings if row["film"]]
     assert sources == ["films/01-seed-0-frameskip-2-5-vs-seed-1-frameskip-2-5.mp4"]

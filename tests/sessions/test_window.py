@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.sessions.window import Window
 
 BLACK = np.zeros((210, 160, 3), np.uint8)
@@ -21,7 +22,7 @@ def press(pygame: Any, key: int) -> None:
 
 
 def test_a_key_pressed_between_two_steps_is_an_action_and_no_key_is_none(pygame: Any) -> None:
-    window = Window(1_000, 1)
+    window = Window("Atlantis", facts_of(game_of("Atlantis-v0")), 1_000, 1)
     for key, action in (
         (pygame.K_LEFT, 3),
         (pygame.K_RIGHT, 2),
@@ -36,7 +37,7 @@ def test_a_key_pressed_between_two_steps_is_an_action_and_no_key_is_none(pygame:
 
 
 def test_the_window_shows_the_whole_screen_upright_and_scaled(pygame: Any) -> None:
-    window = Window(1_000, 2)
+    window = Window("Atlantis", facts_of(game_of("Atlantis-v0")), 1_000, 2)
     screen = BLACK.copy()
     screen[200, 10] = (255, 0, 0)
     window.choose(screen)

@@ -14,7 +14,8 @@ import torch
 from rich.console import Console
 from torch import nn
 
-from atlantis_exp.game.emulator import ACTIONS, Emulator, Step
+from atlantis_exp.components import facts_of, game_of
+from atlantis_exp.game.emulator import Emulator, Step
 from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.game.vector import Emulators, make_emulators
 from atlantis_exp.learning.learner import Learner
@@ -31,6 +32,8 @@ from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.recorder import Recorder
 from atlantis_exp.training.trainer import Trainer
 
+ATLANTIS = facts_of(game_of("Atlantis-v0"))
+NUM_ACTIONS = len(ATLANTIS.actions)
 SIZE = 8  # pixels
 STACK = 4  # observations
 CAPACITY = 120  # observations
@@ -42,6 +45,7 @@ class Game:
     """Takes an Emulator's place: noise on the screen and in the rewards, and an episode is truncated after `steps`."""
 
     steps: int = 40
+    game = ATLANTIS
 
     def __post_init__(self) -> None:
         self.preprocessing = SimpleNamespace(size=SIZE)
@@ -78,7 +82,7 @@ def learner_of(seed: int = 0, **options: Any) -> Learner:
     def network() -> nn.Module:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            return nn.Sequential(nn.Flatten(), nn.Linear(STACK * SIZE * SIZE, len(ACTIONS)))
+            return nn.Sequential(nn.Flatten(), nn.Linear(STACK * SIZE * SIZE, NUM_ACTIONS))
 
     online = network()
     optimizer = torch.optim.AdamW(online.parameters(), 1e-3)
@@ -155,7 +159,7 @@ def small() -> Callable[..., Trainer]:
             plan=plan,
             emulators=emulators_of(num_envs, episode_steps),
             stack=FrameStack(num_envs, SIZE, STACK),
-            actor=EpsilonGreedy(learner.q_values, len(ACTIONS)),
+            actor=EpsilonGreedy(learner.q_values, NUM_ACTIONS),
             memory=memory,
             learner=learner,
             exploration=[np.random.default_rng(child) for child in exploration.spawn(num_envs)],
@@ -168,8 +172,9 @@ def small() -> Callable[..., Trainer]:
                 memory=memory,
                 tracker=Journal(folder),
                 progress=Progress(console or Console(quiet=True)),
-                evaluate=partial(evaluator, EpsilonGreedy(learner.evaluated_q_values, len(ACTIONS), watches=True)),
+                evaluate=partial(evaluator, EpsilonGreedy(learner.evaluated_q_values, NUM_ACTIONS, watches=True)),
                 film=evaluator.film,
+                score_range=ATLANTIS.score_range,
             ),
             checkpoints=Checkpoints(folder / "checkpoints", "small"),
             max_steps=max_steps,

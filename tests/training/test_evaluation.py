@@ -1,19 +1,22 @@
 import csv
 import io
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 
 from atlantis_exp.build import build_learner, make_emulator
+from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.config import Config
 from atlantis_exp.game.vector import make_emulators
-from atlantis_exp.registry import SOURCES
 from atlantis_exp.training.actor import Actor, EpsilonGreedy, RandomActor
 from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate
 
 Compose = Callable[..., Config]
+
+GAME = replace(facts_of(game_of("Atlantis-v0")), sources=())
 
 
 @pytest.fixture
@@ -67,6 +70,7 @@ def test_the_actions_are_counted_by_who_chose_them() -> None:
             Episode(1, 300.0, 12, False, bytearray([0, 1, 1, 3]), bytearray([1, 0, 0, 0])),
             Episode(2, 900.0, 6, True, bytearray([3, 3]), bytearray([1, 0])),
         ],
+        GAME,
     )
     assert evaluation.action_counts.tolist() == [[0, 1], [2, 0], [0, 0], [2, 1]]
     metrics = evaluation.metrics()
@@ -94,6 +98,7 @@ def test_what_the_policy_does_is_counted() -> None:
             episode([0, 1, 1, 3], [1, 0, 0, 1], best=[0, 1, 1, 0]),
             episode([0, 1, 2, 1], [1, 0, 1, 0], best=[1, 1, 0, 1]),
         ],
+        GAME,
     )
     assert evaluation.chance_agreement == 1 / 4
     assert evaluation.favourite == ("FIRE", 1.0)
@@ -107,7 +112,7 @@ def test_what_the_policy_does_is_counted() -> None:
 
 def test_a_policy_that_still_does_something_else_has_not_collapsed() -> None:
     actions, chosen = bytearray([1] * 99 + [2]), bytearray(100)
-    evaluation = Evaluation(0.0, [Episode(1, 0.0, 12, False, actions, chosen)])
+    evaluation = Evaluation(0.0, [Episode(1, 0.0, 12, False, actions, chosen)], GAME)
     assert not evaluation.collapsed
     assert evaluation.policy == "FIRE in 99.0% of the network's decisions"
     assert evaluation.chance_agreement is None
@@ -128,14 +133,15 @@ def test_the_score_is_split_by_what_paid_it(tiny: Compose) -> None:
             RandomActor(4), emulators, episodes=2, epsilon=0.0, seed=5, size=env.size, stack=env.stack
         )
     emulator = make_emulator(env)()
-    totals = dict.fromkeys(SOURCES, 0.0)
+    sources = emulator.game.sources
+    totals = dict.fromkeys(sources, 0.0)
     for episode in evaluation.episodes:
         assert sum(episode.points) == episode.score > 0
         emulator.reset(episode.seed)
         for action in episode.actions:
-            for source, points in zip(SOURCES, emulator.step(action).points, strict=True):
+            for source, points in zip(sources, emulator.step(action).points, strict=True):
                 totals[source] += points
     assert min(totals["centre_vessel"], totals["side_vessel"], totals["wave_bonus"]) > 0
     metrics = evaluation.metrics()
-    assert {source: 2 * metrics[f"evaluation/score_{source}"] for source in SOURCES} == totals
+    assert {source: 2 * metrics[f"evaluation/score_{source}"] for source in sources} == totals
     assert evaluation.table().points.tolist() == [episode.points for episode in evaluation.episodes]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import pytest
 from rich.console import Console
 
+from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.training.evaluation import Episode, Evaluation
 from atlantis_exp.training.progress import Pace, Progress, Snapshot
 
@@ -46,7 +47,9 @@ def test_an_evaluation_says_how_far_it_is_now_and_then(clock: Clock, monkeypatch
 )
 def test_an_early_score_below_random_is_explained(score: float, frames: int, explained: bool) -> None:
     text = io.StringIO()
-    Progress(Console(file=text, width=300)).evaluated(7, frames, Evaluation(0.1, [Episode(0, score, 4)]))
+    Progress(Console(file=text, width=300)).evaluated(
+        7, frames, Evaluation(0.1, [Episode(0, score, 4)], facts_of(game_of("Atlantis-v0")))
+    )
     assert text.getvalue().startswith("step 7, 1 episodes evaluated at epsilon 0.1: ")
     assert f"mean {score:,.0f}" in text.getvalue()
     assert ("at 5 M frames published DQN is at 7,000 to 9,000" in text.getvalue()) == explained

@@ -1,0 +1,45 @@
+"""Atlantis: all that the package knows of this game, with the files `atlantis_*` beside this one.
+
+Three guns defend a city. A life, as ALE counts it, is a building that stands, guns included; it can rise again. A gun
+fires once a press, so that an action that is held fires once.
+"""
+
+from collections.abc import Sequence
+
+from atlantis_exp.registry import component
+
+_WAVE_STATE, _WAVE_OVER = 0x53, 2  # a byte of the console's memory; so from the frame of the bonus to the next wave
+
+
+@component("atlantis", "env")
+class Atlantis:
+    """The game that this package is about.
+
+    A vessel pays 100 and a bomber 1,000 where the centre gun hits it, twice as much where a side gun does; the end of a
+    wave pays 500 for each building that stands, in one frame.
+    """
+
+    actions = ("NOOP", "FIRE", "RIGHTFIRE", "LEFTFIRE")  # FIRE is the gun in the middle
+    score_range = (1e3, 1e6)
+    episode_steps = 2_000  # in `Atlantis-v0`; a good player plays many times longer
+    sources = ("centre_vessel", "side_vessel", "centre_bomber", "side_bomber", "wave_bonus")
+    sources_in_words = (
+        "vessels and bombers, each hit by the centre gun or a side gun, and the bonus for the buildings that stand at "
+        "a wave's end"
+    )
+    random_score = 12_850.0
+    human_score = 29_028.1
+    published_in_words = "above a million the time cap decides"
+    held_score = 2_000.0
+    early_frames = 10_000_000
+    early_scores = "at 5 M frames published DQN is at 7,000 to 9,000 (docs/comparison.md)"
+    keys = (("left", "LEFTFIRE"), ("right", "RIGHTFIRE"), ("up", "FIRE"), ("space", "FIRE"))
+    keys_in_words = "left, up, right fire a gun each; a gun fires once a press"
+
+    @staticmethod
+    def points(reward: int, ram: Sequence[int]) -> Sequence[float]:
+        """The parts of a frame's reward, as `sources`; `ram` is the console's, 128 bytes, after the frame."""
+        if ram[_WAVE_STATE] == _WAVE_OVER:
+            return 0, 0, 0, 0, reward
+        bombers, vessels = divmod(reward // 100, 10)  # of several hits in one frame the centre gun has one at most
+        return vessels % 2 * 100, vessels // 2 * 200, bombers % 2 * 1_000, bombers // 2 * 2_000, 0
