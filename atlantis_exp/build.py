@@ -174,6 +174,8 @@ def needs(config: cfg.Config) -> str:
     there = {each.plugin.name: each.plugin for each in admitted().values() if each.plugin}
     wanted = {name: describe(name, each.version, each.sha256) for name, each in config.plugins.items()}
     lacking = {name: text for name, text in wanted.items() if str(there.get(name)) != text}
+    if not lacking:
+        return f"env.id={config.env.id}: none of the plugins has this game"
     given = [f"; {there[name].shown} is {there[name]}, which makes another run" for name in lacking if name in there]
     names = [name if config.plugins[name].version else f"./{name}.py" for name in lacking]
     return f"needs plugins={','.join(names)} ({'; '.join(lacking.values())}){''.join(given)}"

@@ -111,7 +111,7 @@ class Component:
         return loaded
 
     def beside(self, name: str) -> Path:
-        """The path of a file that comes with it: of `atlantis` and `scores.csv`, `atlantis_scores.csv` next to it."""
+        """The path of a file that comes with it: of `pong` and `scores.csv`, `pong_scores.csv` next to it."""
         return self.source.path.with_name(f"{self.name}_{name}")
 
     @contextmanager
@@ -261,7 +261,7 @@ def known(kind: str) -> dict[str, Component]:
 
 
 def game_ids(name: str) -> tuple[str, str]:
-    """Gymnasium's two ids of a game: of `atlantis`, Atlantis-v0 and ALE/Atlantis-v5."""
+    """Gymnasium's two ids of a game: of `pong`, Pong-v0 and ALE/Pong-v5."""
     title = name.title().replace("_", "")
     return f"{title}-v0", f"ALE/{title}-v5"
 
@@ -272,7 +272,7 @@ def game_of(env_id: str) -> Component | None:
 
 
 def title_of(env_id: str) -> str:
-    """What people call the game of one of Gymnasium's ids: of ALE/Atlantis-v5, Atlantis."""
+    """What people call the game of one of Gymnasium's ids: of ALE/Pong-v5, Pong."""
     return env_id.rpartition("/")[2].partition("-v")[0]
 
 

@@ -46,7 +46,7 @@ SCREEN = (210, 160)  # rows, columns of the emulator's screen
 class EnvConfig:
     """One game and how its screen becomes an observation (report figure 2.3)."""
 
-    id: Annotated[str, Field(max_length=100)]  # Gymnasium's, which names the game
+    id: Annotated[str, Field(pattern=r"^[\w/.-]{1,100}$")]  # Gymnasium's, which names the game
     frameskip: Frameskip | tuple[Frameskip, Frameskip]  # frames a step; a pair is drawn from [low, high)
     sticky: Probability
     max_frames: Annotated[int, Field(ge=1, lt=2**31)]  # frames an episode

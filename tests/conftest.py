@@ -251,6 +251,7 @@ def recorded(tiny: Callable[..., Config]) -> Callable[..., Path]:
         steps: int = 160,
     ) -> Path:
         config = tiny(*overrides)
+        game = facts_of(config.game)
         folder = RunFolder.of(config)
         journal = Journal(folder.path)
         folder.write_config(to_dict(config))
@@ -262,11 +263,11 @@ def recorded(tiny: Callable[..., Config]) -> Callable[..., Path]:
         episodes = [
             Episode(
                 *(index, score, 12, index < truncated, bytearray([0, 1, 2, 3]), bytearray([0, 0, 0, 1])),
-                points=[0.0, score / 4, 0.0, 0.0, score * 3 / 4],
+                points=[0.0, score / 4, 0.0, 0.0, score * 3 / 4][: len(game.sources)],
             )
             for index, score in enumerate(scores)
         ]
-        evaluation = Evaluation(config.evaluation.epsilon, episodes, facts_of(config.game))
+        evaluation = Evaluation(config.evaluation.epsilon, episodes, game)
         journal.artifact(evaluation_at(steps), evaluation.table().to_csv().encode())
         journal.finish()
         folder.write_result(Result("finished", steps, {}, evaluation.metrics(), evaluation.report()))

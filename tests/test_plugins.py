@@ -519,6 +519,7 @@ def test_the_page_does_what_it_says(
     page = (ROOT / "docs" / "extending.md").read_text()
     (network,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     (tmp_path / "mynet.py").write_text(network)
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
     lines = [line for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL) for line in block.splitlines()]
     place = f"paths.outputs={tmp_path / 'outputs'}"
@@ -527,6 +528,7 @@ def test_the_page_does_what_it_says(
     more: dict[str, list[str]] = {
         "decide": ["--cfg", "job"],
         "check": ["--cfg", "job"],
+        "baseline": ["evaluation.episodes=1", *played[1:], "env.max_steps=20", "tracking=none"],
         "compare": ["tracking=none", place],
         "evaluate": [*played, "tracking=none"],
         "export": [*played],

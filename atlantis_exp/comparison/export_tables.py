@@ -10,6 +10,7 @@ from typing import Any
 from atlantis_exp.comparison.gather import AXES
 from atlantis_exp.comparison.published import Row, Table
 from atlantis_exp.comparison.report import COLUMNS, cells, label, number, shown_columns
+from atlantis_exp.components import facts_of, known
 
 _FRACTION = "fraction"
 """The unit of shares and probabilities, from 0 to 1; LaTeX has percent instead, as a person reads them."""
@@ -20,6 +21,7 @@ _POINTS = (
     *("leader_score", "other_score", "difference", "difference_low", "difference_high"),
     *("upper_score", "lower_score", "detectable", "delta", "score_low", "score_high"),
     *("later_score", "other_later_score"),
+    *(source for game in known("env").values() for source in facts_of(game).sources),
 )
 _FRACTIONS = (
     *("time_cap_share", "truncated_share", "random_share", "probability", "share", "network", "random"),
@@ -42,8 +44,7 @@ UNITS: Mapping[str, str] = {
     **dict.fromkeys(("seeds", "next_look"), "seeds"),
 }
 """A column of a comparison's tables, or of `load_runs`, to its unit; frames are the emulator's, FLOPs those of gradient
-updates. A column that is not here counts something that its name says, is what pays points in a game (in points),
-or is no quantity."""
+updates. A column that is not here counts something that its name says, or is no quantity."""
 
 _UNITS_OF: Mapping[str, Mapping[str, str]] = {
     "partings": {"step": "steps", "frame": "frames"},

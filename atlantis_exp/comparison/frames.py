@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from atlantis_exp.checking import flatten, to_dict
 from atlantis_exp.comparison.gather import Training, select
-from atlantis_exp.components import facts_of, game_of
+from atlantis_exp.components import facts_of, game_of, known
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.facts import read_facts
@@ -296,7 +296,8 @@ def _assemble(read: Sequence[_Run], skipped: dict[str, str]) -> Runs:
 
     # By step, and of one step the training's own first, then the others by their age.
     evaluations = [pair for run in read for pair in sorted(run.evaluations, key=lambda pair: int(pair[0]["step"]))]
-    sources = [*dict.fromkeys(source for run in read for source in run.sources)]
+    pays = [run.sources for run in read] or [facts_of(game).sources for game in known("env").values()]
+    sources = [*dict.fromkeys(source for each in pays for source in each)]
     columns = [*_EVALUATION, *sources]
     sizes = [row["episodes"] for row, _ in evaluations]
     episodes = {key: np.repeat(np.array([row[key] for row, _ in evaluations], object), sizes) for key in _PLACE}

@@ -198,9 +198,9 @@ def refuse_mixed_protocols(trainings: Sequence[Training], by: Sequence[str]) -> 
     for training in trainings:
         games[title_of(training.config["env.id"])].append(training.name)
     if len(games) > 1:
+        named = _holding(dict(sorted(games.items())))
         raise ConfigError(
-            f"env.id differs: scores of different games are not compared: {_holding(games)}; choose with runs= or "
-            "where=env.id=ID"
+            f"env.id differs: scores of different games are not compared: {named}; choose with runs= or where=env.id=ID"
         )
     for key in PROTOCOL:
         if any(key == resolve(asked, training.config) for asked in by for training in trainings):

@@ -32,7 +32,7 @@ class Emulator:
 
     game: its ROM, its actions, of which an action is an index, and what pays its points. Raises ConfigError where ALE
         has no such ROM, or other actions.
-    frameskip: frames in a step, or (low, high): drawn from low to high - 1 in every step, as in `Atlantis-v0`.
+    frameskip: frames in a step, or (low, high): drawn from low to high - 1 in every step, as in the report.
     sticky: probability that a frame repeats the action of the one before (Machado et al., 2018).
     max_frames: frames after which an episode is truncated.
     max_steps: steps after which an episode is truncated (27,000 in report figure 1.3), or None.

@@ -11,7 +11,7 @@ class FrameStore:
     """Ring of compressed uint8 frames with consecutive ids that never takes more than `budget_bytes`.
 
     Every frame is one LZ4 block whose dictionary is the first frame ever encoded: whatever of the background stays as
-    it was at the start of play costs next to nothing (in Atlantis without a crop half of all bytes), and decoding is as
+    it was at the start of play costs next to nothing (without a crop half of all bytes), and decoding is as
     fast. Memory that frames have not reached yet is reserved but not resident.
 
     Args:

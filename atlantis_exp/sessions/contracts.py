@@ -17,7 +17,7 @@ from rich.table import Table
 from torch import nn
 
 from atlantis_exp import terminal
-from atlantis_exp.build import build_component, build_learner, build_trainer, import_components
+from atlantis_exp.build import build_component, build_learner, build_trainer, import_components, make_emulator
 from atlantis_exp.config import Config
 from atlantis_exp.faults import Fault
 from atlantis_exp.learning.learner import Learner
@@ -93,6 +93,7 @@ def trials(config: Config, small: Job) -> Iterator[tuple[str, str, Callable[[], 
         yield sampler, "state there and back", partial(_sampler_continues, config, phase)
     yield f"epsilon={config.epsilon.name}", "in [0, 1], before and past the end", partial(_epsilon_holds, config)
     yield f"lr_schedule={config.lr_schedule.name}", "finite, not negative", partial(_rate_holds, config)
+    yield f"env.id={config.env.id}", "actions are ALE's, points sum to rewards", partial(_pays, config)
     yield "all", "killed and continued is unbroken, bit for bit", partial(_resumes, small)
 
 
@@ -253,6 +254,17 @@ def _rate_holds(config: Config) -> None:
 def _scheduled(schedule: Any) -> list[float]:
     with _no_global_stream():
         return [float(schedule(step / 100, 1_000 * step)) for step in range(151)]
+
+
+def _pays(config: Config) -> None:
+    emulator, rng = make_emulator(config.env)(), np.random.default_rng(0)
+    emulator.reset(seed=0)
+    for _ in range(500):
+        step = emulator.step(int(rng.integers(len(emulator.game.actions))))
+        is_split = bool(emulator.game.sources)
+        _hold(not is_split or sum(step.points) == step.reward, f"{step.points} for a reward of {step.reward}")
+        if step.terminated or step.truncated:
+            emulator.reset()
 
 
 def _resumes(small: Job) -> None:

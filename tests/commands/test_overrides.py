@@ -191,7 +191,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("query env=atlantis", "env=atlantis", "'atlantis_v"),
     ("query env.siz=1", "env.siz", "'env.size'"),
     ("baseline agent=rndom", "agent=rndom", "'random'"),
-    ("baseline agent.action=4", "agent.action=4", "less than or equal to 3"),
+    ("baseline agent.action=4", "agent.action=4", "3 LEFTFIRE"),
     ("baseline optimizer.lr=1", "optimizer.lr=1", "no such key"),
     ("evaluate evaluation.epsilon=2", "evaluation.epsilon=2", "less than or equal to 1"),
     ("evaluate epsilom=0.1", "epsilom=0.1", "no such key"),

@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from atlantis_exp.build import build_game
 from atlantis_exp.comparison.figures import draw
 from atlantis_exp.comparison.gather import gather, group
 from atlantis_exp.comparison.published import curves, early_dqn, scores
 from atlantis_exp.comparison.report import cells
 from atlantis_exp.comparison.tables import Comparison, compare, to_csv
 from atlantis_exp.comparison.verdict import Question
-from atlantis_exp.components import facts_of, game_of
+from atlantis_exp.components import facts_of, known
 from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.preprocessing import Preprocessing
 from atlantis_exp.game.vector import make_emulators
@@ -35,7 +36,7 @@ GOOD = (
 )
 BAD = ((3_000.0, 3_300.0, 3_400.0, 3_600.0), (3_100.0, 3_200.0, 3_400.0, 3_700.0), (3_000.0, 3_100.0, 3_500.0, 3_600.0))
 
-ATLANTIS = game_of("Atlantis-v0")
+ATLANTIS = known("env")["atlantis"]
 SOURCES = facts_of(ATLANTIS).sources
 
 
@@ -69,6 +70,7 @@ def played(actor: int, frames: int, seed: int) -> EpisodeTable:
     """Two episodes of the game itself by a player that chooses among the first actions, cut at some frames."""
     make = partial(
         Emulator,
+        game=build_game(ATLANTIS),
         preprocessing=Preprocessing(32, (14, 160, 94, 0)),
         frameskip=4,
         sticky=0.25,

@@ -94,7 +94,7 @@ def test_pictures_count_windows_and_evaluations_so_that_runs_stand_side_by_side(
     pictures = tmp_path / "artifacts/images"
     assert b"'training, episodes 3-4'" in (pictures / "score/histogram/1.png").read_bytes()
     assert b"[20, 40, 60, 80], " in (pictures / "score/heatmap/1.png").read_bytes()
-    assert b"160, 'steps')" in (pictures / "score/heatmap/1.png").read_bytes()
+    assert b"160, 'steps', (1000.0, 1000000.0))" in (pictures / "score/heatmap/1.png").read_bytes()
     assert b"'evaluation, step 80'" in (pictures / "evaluation/histogram/1.png").read_bytes()
 
 
