@@ -280,7 +280,9 @@ def test_what_was_trained_is_evaluated_compared_and_reported(
     assert len((evaluated / "artifacts/evaluation/episodes.csv").read_text().splitlines()) == 4
 
     assert command("compare", "by=seed", "at_epsilon=0.05", "tracking=none", place) == 0
-    page = Path(capsys.readouterr().out.rstrip().splitlines()[-1])
+    *_, ui, _, path = capsys.readouterr().out.rstrip().splitlines()
+    assert ui.endswith(f"ui {place}")
+    page = Path(path)
     assert page.is_relative_to(tmp_path / "comparisons")
     runs = (page.parent / "tables" / "runs.csv").read_text()
     assert first in runs

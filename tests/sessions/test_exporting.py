@@ -1,6 +1,7 @@
 """Exported weights: what a folder of them holds, and when there is none."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
+from atlantis_exp.comparison.gather import gather
 from atlantis_exp.config import Config
 from atlantis_exp.sessions import cards
 from atlantis_exp.sessions.cards import read_card
@@ -60,7 +62,20 @@ def test_exported_weights_score_what_their_card_says(
     (recorded,) = (trained / "evaluations").iterdir()
     facts = json.loads((recorded / "config.json").read_text())
     assert (facts["sha256"], facts["evaluation"]["num_envs"]) == (card.sha256, 1)
-    assert (recorded / "artifacts" / "best_episode.mp4").stat().st_size > 1_000
+    film = recorded / "artifacts" / "best_episode.mp4"
+    assert film.stat().st_size > 1_000
+
+    # What was trained here is shown with them where they played the same game at the same epsilon.
+    (player,) = gather(trained).players
+    assert (player.called, player.episodes.scores.tolist()) == ("weights tiny", list(card.scores))
+    compare = ("compare", f"paths.outputs={trained}", "tracking=none")
+    assert command(*compare) == 0
+    assert "weights tiny" not in capsys.readouterr().out
+    assert command("evaluate", *played, "epsilon=0.05", "episodes=2") == 0
+    capsys.readouterr()
+    assert command(*compare) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"In the same game, on average: weights tiny [\d,]+\.", said)
 
 
 def test_an_export_neither_overwrites_nor_starts_without_weights(
