@@ -17,8 +17,9 @@ from hydra import compose, initialize_config_dir
 from rich.console import Console
 
 from atlantis_exp.build import build_baseline, build_plan, make_emulator
+from atlantis_exp.commands import CONF
 from atlantis_exp.commands.baseline import BaselineConfig
-from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.commands.composing import checked
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.journal import NullJournal

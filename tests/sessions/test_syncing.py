@@ -19,7 +19,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from mlflow.store.entities import PagedList
 
-from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.commands import CONF
+from atlantis_exp.commands.composing import checked
 from atlantis_exp.commands.sync import SyncConfig
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import write_file
