@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, cast
 
 import gymnasium
 import numpy as np
-from ale_py import ALEInterface, ALEState, LoggerMode
+from ale_py import Action, ALEInterface, ALEState, LoggerMode
 from ale_py.roms import get_rom_path
 
 from atlantis_exp.game.preprocessing import PALETTE, SCREEN_HEIGHT, SCREEN_WIDTH, Pixels, Preprocessing
@@ -65,8 +65,8 @@ class Emulator:
         self._ale = ALEInterface()
         self._ale.setFloat("repeat_action_probability", sticky)
         self._ale.setInt("max_num_frames_per_episode", max_frames)
-        self._load_game(seed=0)
-        self._actions = self._ale.getMinimalActionSet()
+        self._is_loaded = False  # which takes as long as a thousand frames, and a seed needs it anew
+        self._actions = [getattr(Action, name) for name in ACTIONS]
         self._steps = 0
         self._screen: Pixels = np.zeros((SCREEN_HEIGHT, SCREEN_WIDTH), np.uint8)
         self._pool = preprocessing.grey(self._screen)  # of the last step, cropped; max_pool only
@@ -87,8 +87,8 @@ class Emulator:
 
     def reset(self, seed: int | None = None) -> Pixels:
         """Begins an episode and returns its first observation; without a seed the random streams go on."""
-        if seed is not None:
-            self._load_game(seed)
+        if seed is not None or not self._is_loaded:
+            self._load_game(seed or 0)
         self._keep_origin()
         self._begun = True
         self._ale.reset_game()
@@ -142,6 +142,8 @@ class Emulator:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Plays the episode again up to where it was: a second for some 4,000 steps."""
+        if not self._is_loaded:
+            self._load_game(0)
         self._ale.restoreState(ALEState(state["ale"].tobytes()))
         self._generator.bit_generator.state = state["generator"]
         self._keep_origin()
@@ -156,6 +158,7 @@ class Emulator:
         self._generator = np.random.default_rng(own_seed)
         self._ale.setInt("random_seed", ale_seed.astype(np.int32))
         self._ale.loadROM(cast(Path, get_rom_path("atlantis")))
+        self._is_loaded = True
         self._keep_origin()
 
     def _keep_origin(self) -> None:
