@@ -348,7 +348,9 @@ def test_every_folder_of_the_outputs_is_published_and_stays_at_home(tmp_path: Pa
 @pytest.mark.slow
 def test_it_goes_on_looking_until_it_is_interrupted(outputs: Path) -> None:
     command = (sys.executable, "-m", "atlantis_exp", "sync", "every=1s", f"paths.outputs={outputs}")
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background job lacks
     looking = subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    signal.signal(signal.SIGINT, before)
     try:
         assert looking.stdout is not None
         assert looking.stdout.readline().endswith("mlflow.db: 0 runs\n")
