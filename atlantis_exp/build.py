@@ -1,6 +1,5 @@
 """The composition root: a checked config enters, a trainer or an evaluation made of built parts leaves."""
 
-import dataclasses
 import os
 import zlib
 from collections.abc import Callable
@@ -24,6 +23,7 @@ from atlantis_exp.game.preprocessing import FrameStack, Preprocessing
 from atlantis_exp.game.vector import Emulators, make_emulators
 from atlantis_exp.learning.allocation import keep_freed_memory
 from atlantis_exp.learning.learner import Learner
+from atlantis_exp.learning.values import ActionValues
 from atlantis_exp.networks.dropout import seed_dropout
 from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
 from atlantis_exp.replay.memory import ReplayMemory, Returns
@@ -196,18 +196,11 @@ def build_optimizer(optimizer: cfg.AdamConfig | cfg.RmsPropConfig, network: nn.M
 
 def build_learner(config: cfg.Config) -> Learner:
     """Both networks, the optimizer, the objective; sets torch's threads for this process, and keeps memory it frees."""
-    keep_freed_memory()
-    device = choose_device(config.device)
-    target = config.objective.target
-    threads = config.threads or _THREADS
+    device, target = choose_device(config.device), config.objective.target
     network = build_network(config, "network").to(device)
     target_network = build_network(config, "target").to(device)
     if target.start == "copy":
         target_network.load_state_dict(network.state_dict())
-    component = config.model.component
-    is_split = component is not None and component.facts["splits_batches"]
-    shards = threads if device.type == "cpu" and is_split else 1
-    torch.set_num_threads(threads // shards)
     return Learner(
         network,
         target_network,
@@ -217,10 +210,20 @@ def build_learner(config: cfg.Config) -> Learner:
         target_every=target.every,
         precision=choose_precision(config.training.precision, device),  # type: ignore[arg-type]
         target_mode=target.mode,
-        shards=shards,
+        shards=_share_cores(config, device),
         ema=config.training.ema,
         compile=_compiled if config.compile else None,
     )
+
+
+def _share_cores(config: cfg.Config, device: torch.device) -> int:
+    """Set torch's threads and keep memory that is freed, for this process; the shards of a batch."""
+    keep_freed_memory()
+    threads, component = config.threads or _THREADS, config.model.component
+    is_split = component is not None and component.facts["splits_batches"]
+    shards = threads if device.type == "cpu" and is_split else 1
+    torch.set_num_threads(threads // shards)
+    return shards
 
 
 def _compiled(network: nn.Module) -> nn.Module:
@@ -260,13 +263,16 @@ def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Acto
         tensors = safetensors.torch.load(weights)
         with torch.device("meta"):  # shapes first: a card may claim a network that no memory holds
             _architecture(config).load_state_dict(tensors, assign=True)
-        learner = build_learner(dataclasses.replace(config, device=device, compile=False))
-        learner.load_state_dict({**learner.state_dict(), "network": tensors})
+        where = choose_device(device)
+        network = build_network(config, "network").to(where)
+        network.load_state_dict(tensors)
+        precision = choose_precision(config.training.precision, where)
+        values = ActionValues(network, precision=precision, shards=_share_cores(config, where))  # type: ignore[arg-type]
     except Fault:  # of a plugin
         raise
     except (SafetensorError, RuntimeError) as error:
         raise Fault(f"the weights are damaged or another network's: {' '.join(str(error).split())}") from error
-    return EpsilonGreedy(learner.q_values, len(ACTIONS), watches=True)
+    return EpsilonGreedy(values.q_values, len(ACTIONS), watches=True)
 
 
 def build_person(env: cfg.EnvConfig, choose: Callable[[npt.NDArray[np.uint8]], int]) -> tuple[PersonActor, Emulators]:
