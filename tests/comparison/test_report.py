@@ -113,6 +113,7 @@ def test_a_term_in_a_header_is_explained_and_nothing_else_is(comparison: Compari
     assert len(said) < len(headers)
 
 
+@pytest.mark.slow
 def test_few_episodes_are_dots_and_many_a_histogram(recorded: Recorded, tmp_path: Path) -> None:
     def drawn() -> Drawn:
         gathered = gather(tmp_path)
@@ -127,6 +128,7 @@ def test_few_episodes_are_dots_and_many_a_histogram(recorded: Recorded, tmp_path
     assert many.alt.startswith("Histogram")
 
 
+@pytest.mark.slow
 def test_two_bands_at_most_lie_over_each_other(recorded: Recorded, tmp_path: Path) -> None:
     for index, model in enumerate(("cnn", "resnet", "resnet_fast")):
         for seed in range(5):
