@@ -17,10 +17,11 @@ $(VENV)/.installed: pyproject.toml
 
 setup: $(VENV)/.installed  ## create .venv and install everything
 
-run: setup  ## random baseline, both networks trained and evaluated on the CPU, the report's table
+run: setup  ## random baseline, both networks trained, the shipped one plays; a film, a page, a verdict
 	$(BIN)/python -m atlantis_exp baseline evaluation=quick
-	$(BIN)/python -m atlantis_exp -m experiment=quick model=cnn,resnet
-	$(BIN)/python -m atlantis_exp report
+	$(BIN)/python -m atlantis_exp -m experiment=quick model=cnn,resnet phase.quick.steps=1_500
+	$(BIN)/python -m atlantis_exp evaluate weights=pretrained/cnn_fast evaluation=quick episodes=1
+	$(BIN)/python -m atlantis_exp compare
 
 test: lint  ## lint, types and the quick tests
 	$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2 --dist loadfile

@@ -19,11 +19,12 @@ from atlantis_exp import config as cfg
 from atlantis_exp.checking import to_dict
 from atlantis_exp.components import Component, Method, admitted, describe, facts_of
 from atlantis_exp.faults import ConfigError, Fault
-from atlantis_exp.game.emulator import Emulator
+from atlantis_exp.game.emulator import Emulator, check_game
 from atlantis_exp.game.preprocessing import FrameStack, Preprocessing
 from atlantis_exp.game.vector import Emulators, make_emulators
 from atlantis_exp.learning.allocation import keep_freed_memory
 from atlantis_exp.learning.learner import Learner
+from atlantis_exp.learning.values import ActionValues
 from atlantis_exp.networks.dropout import seed_dropout
 from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
 from atlantis_exp.registry import Game
@@ -55,6 +56,8 @@ def stream(seed: int, name: str) -> np.random.SeedSequence:
 def build_game(component: Component) -> Game:
     """What a game says of itself, with its code where it has parts of a score."""
     game = facts_of(component)
+    if component.plugin is not None:
+        check_game(game)
     if not game.sources:
         return game
     # What a plugin's file defines, a worker process cannot import.
@@ -221,18 +224,11 @@ def build_optimizer(optimizer: cfg.AdamConfig | cfg.RmsPropConfig, network: nn.M
 
 def build_learner(config: cfg.Config) -> Learner:
     """Both networks, the optimizer, the objective; sets torch's threads for this process, and keeps memory it frees."""
-    keep_freed_memory()
-    device = choose_device(config.device)
-    target = config.objective.target
-    threads = config.threads or _THREADS
+    device, target = choose_device(config.device), config.objective.target
     network = build_network(config, "network").to(device)
     target_network = build_network(config, "target").to(device)
     if target.start == "copy":
         target_network.load_state_dict(network.state_dict())
-    component = config.model.component
-    is_split = component is not None and component.facts["splits_batches"]
-    shards = threads if device.type == "cpu" and is_split else 1
-    torch.set_num_threads(threads // shards)
     return Learner(
         network,
         target_network,
@@ -242,10 +238,20 @@ def build_learner(config: cfg.Config) -> Learner:
         target_every=target.every,
         precision=choose_precision(config.training.precision, device),  # type: ignore[arg-type]
         target_mode=target.mode,
-        shards=shards,
+        shards=_share_cores(config, device),
         ema=config.training.ema,
         compile=_compiled if config.compile else None,
     )
+
+
+def _share_cores(config: cfg.Config, device: torch.device) -> int:
+    """Set torch's threads and keep memory that is freed, for this process; the shards of a batch."""
+    keep_freed_memory()
+    threads, component = config.threads or _THREADS, config.model.component
+    is_split = component is not None and component.facts["splits_batches"]
+    shards = threads if device.type == "cpu" and is_split else 1
+    torch.set_num_threads(threads // shards)
+    return shards
 
 
 def _compiled(network: nn.Module) -> nn.Module:
@@ -285,13 +291,16 @@ def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Acto
         tensors = safetensors.torch.load(weights)
         with torch.device("meta"):  # shapes first: a card may claim a network that no memory holds
             _architecture(config).load_state_dict(tensors, assign=True)
-        learner = build_learner(dataclasses.replace(config, device=device, compile=False))
-        learner.load_state_dict({**learner.state_dict(), "network": tensors})
+        where = choose_device(device)
+        network = build_network(config, "network").to(where)
+        network.load_state_dict(tensors)
+        precision = choose_precision(config.training.precision, where)
+        values = ActionValues(network, precision=precision, shards=_share_cores(config, where))  # type: ignore[arg-type]
     except Fault:  # of a plugin
         raise
     except (SafetensorError, RuntimeError) as error:
         raise Fault(f"the weights are damaged or another network's: {' '.join(str(error).split())}") from error
-    return EpsilonGreedy(learner.q_values, _num_actions(config), watches=True)
+    return EpsilonGreedy(values.q_values, _num_actions(config), watches=True)
 
 
 def build_person(env: cfg.EnvConfig, choose: Callable[[npt.NDArray[np.uint8]], int]) -> tuple[PersonActor, Emulators]:

@@ -210,8 +210,8 @@ def equal_scores(scores: Mapping[str, Sequence[float]]) -> list[list[str]]:
 def mean_interval(values: npt.ArrayLike, level: float = 0.95) -> tuple[float, float]:
     """Student's interval of the mean over seeds, one value a seed; NaN for fewer than two.
 
-    It covers what it says for normal values. For bimodal ones (70:30) its 95 % are 73 at three seeds, 81 at five and 93
-    at ten, for log-normal ones 82 to 85: `python -m benchmarks.decisions`.
+    It covers what it says for normal values. For bimodal ones (70:30) its 95 % are 72 at three seeds, 83 at five and 94
+    at ten, for log-normal ones 82 to 84: `python -m benchmarks.decisions`.
     """
     seeds = np.asarray(values, np.float64)
     if seeds.size < 2:

@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from atlantis_exp.build import make_emulator
-from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.commands import CONF
+from atlantis_exp.commands.composing import checked
 from atlantis_exp.commands.query import QueryConfig
 from atlantis_exp.game.atlantis import Atlantis
 

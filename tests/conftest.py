@@ -24,8 +24,8 @@ from rich.console import Console
 
 from atlantis_exp.build import build_trainer
 from atlantis_exp.checking import to_dict
-from atlantis_exp.commands import main
-from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.commands import CONF, main
+from atlantis_exp.commands.composing import checked
 from atlantis_exp.components import facts_of
 from atlantis_exp.config import Config
 from atlantis_exp.runs.folder import Result, RunFolder, evaluation_at

@@ -1,9 +1,14 @@
 """What is built from a config, counted."""
 
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 from atlantis_exp.build import build_learner
 from atlantis_exp.config import Config
+
+REPOSITORY = Path(__file__).parents[1]
 
 
 def test_the_operations_of_an_update_are_those_counted_by_hand(tiny: Callable[..., Config]) -> None:
@@ -22,3 +27,15 @@ def test_the_operations_of_an_update_are_those_counted_by_hand(tiny: Callable[..
     assert counted("env.size=84") == 4 * (sample + forward)
     assert counted("env.size=84", "objective=double_dqn") == 4 * (sample + 2 * forward)
     assert 4 * 1.8e9 < counted("model=resnet", "env.size=159") < 4 * 1.9e9
+
+
+def test_a_network_plays_without_what_it_was_learned_by() -> None:
+    """An optimizer imports torch._dynamo, which takes as long as torch itself."""
+    code = (
+        "import sys; from pathlib import Path; "
+        "from atlantis_exp.sessions.cards import build_exported_actor, read_card; "
+        "card, weights = read_card(Path('pretrained/cnn_fast')); "
+        "build_exported_actor(card.config, weights, 'cpu'); print('torch._dynamo' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"

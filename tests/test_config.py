@@ -10,7 +10,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from atlantis_exp.checking import flatten, parse, to_dict
-from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.commands import CONF
+from atlantis_exp.commands.composing import checked
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 

@@ -27,7 +27,8 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from atlantis_exp.build import build_learner, build_plan
-from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.commands import CONF
+from atlantis_exp.commands.composing import checked
 from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.config import Config
 from atlantis_exp.replay.memory import ReplayMemory

@@ -17,8 +17,9 @@ from hydra import compose, initialize_config_dir
 from rich.console import Console
 
 from atlantis_exp.build import build_baseline, build_plan, make_emulator
+from atlantis_exp.commands import CONF
 from atlantis_exp.commands.baseline import BaselineConfig
-from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.commands.composing import checked
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.journal import NullJournal
@@ -280,7 +281,9 @@ def test_what_was_trained_is_evaluated_compared_and_reported(
     assert len((evaluated / "artifacts/evaluation/episodes.csv").read_text().splitlines()) == 4
 
     assert command("compare", "by=seed", "at_epsilon=0.05", "tracking=none", place) == 0
-    page = Path(capsys.readouterr().out.rstrip().splitlines()[-1])
+    *_, ui, _, path = capsys.readouterr().out.rstrip().splitlines()
+    assert ui.endswith(f"ui {place}")
+    page = Path(path)
     assert page.is_relative_to(tmp_path / "comparisons")
     runs = (page.parent / "tables" / "runs.csv").read_text()
     assert first in runs

@@ -6,6 +6,7 @@ nowhere else; what a verb does lives in `sessions` and `comparison`.
 
 import importlib
 import sys
+from pathlib import Path
 
 VERBS = {
     "train": "one run, from a composed config; the same command again continues or reports it (the default verb)",
@@ -26,6 +27,13 @@ VERBS = {
 }
 """Each verb and what it does, as `--help` lists them."""
 
+_PACKAGE = Path(__file__).resolve().parents[1]
+CHECKOUT = _PACKAGE.parent
+CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else CHECKOUT / "conf"
+"""The config groups, those of a checkout or those that an installed package brings."""
+PROGRAM = "python -m atlantis_exp" if CONF.parent == CHECKOUT else "atlantis-exp"
+"""What a person calls."""
+
 
 def main() -> None:
     """Run the verb that the command line names first; only its own module is imported."""
@@ -39,6 +47,11 @@ def main() -> None:
         sys.exit(2)
     else:
         verb, arguments = "train", sys.argv[1:]
+    if {"--help", "-h"} & {*arguments}:
+        from atlantis_exp.commands.helping import help_text
+
+        print(help_text(verb, arguments))
+        sys.exit(0)
     try:
         importlib.import_module(f"atlantis_exp.commands.{verb.replace('-', '_')}").VERB.run(arguments)
     except KeyboardInterrupt:  # before there is anything to lose, or a verb would have said so

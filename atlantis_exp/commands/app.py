@@ -12,9 +12,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from atlantis_exp.commands.composing import CONF, admit, checked
-from atlantis_exp.commands.overrides import check, launcher, located, refuse_twice
-from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.commands import CONF
+from atlantis_exp.commands.composing import admit, checked
+from atlantis_exp.commands.overrides import check, is_run, launcher, located, refuse_twice
+from atlantis_exp.faults import Fault
 from atlantis_exp.sessions.job import command_line
 from atlantis_exp.sessions.launchers import Launcher, job_apart
 
@@ -68,7 +69,11 @@ class Verb(Generic[T]):
             jobs = check(config_name, self.schema, arguments)
             chosen = launcher(config_name, arguments)
             flags = tuple(text for text in arguments if text.startswith("--config-dir="))
-        except ConfigError as error:
+            if is_run(arguments):  # which Hydra itself would compose twice more
+                ((overrides, config),) = jobs.items()
+                self.work(Asked(config, self.name, (*flags, *overrides), job_apart(), typed))()
+                return
+        except (Fault, OSError) as error:
             exit_with(error)
 
         @hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)

@@ -19,7 +19,7 @@ from yaml import YAMLError
 
 from atlantis_exp import components
 from atlantis_exp.checking import parse
-from atlantis_exp.commands import VERBS
+from atlantis_exp.commands import CHECKOUT, CONF
 from atlantis_exp.config import record_plugins
 from atlantis_exp.faults import ConfigError
 
@@ -28,32 +28,15 @@ T = TypeVar("T")
 _LIKE = {"model": "cnn", "objective": "dqn", "env": "atlantis_standard"}
 """Of each kind whose components have keys besides their settings, ours with these alone; of games the protocol."""
 
-_PACKAGE = Path(__file__).resolve().parents[1]
-_CHECKOUT = _PACKAGE.parent
-CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _CHECKOUT / "conf"
-
 
 def _outputs_folder() -> str:
     # A checkout keeps its runs whatever the current folder is; an installed package has no place of its own.
-    return str((_CHECKOUT if CONF.parent == _CHECKOUT else Path.cwd()) / "outputs")
-
-
-def _help(config_name: str) -> str:
-    verb = "train" if config_name == "config" else config_name
-    verbs = "\n".join(f"  {verb:15}{purpose}" for verb, purpose in VERBS.items())
-    own = "".join(
-        f"  plugins={name} ({parts[0].plugin}): {', '.join(f'{part.kind}={part.name}' for part in parts)}\n"
-        for name, parts in components.installed().items()
-        if parts
-    )
-    plugins = f"\n== Plugins ==\n{own}" if own else ""
-    return f"python -m atlantis_exp {verb} KEY=VALUE ...\n{VERBS[verb]}\n\n== Verbs ==\n{verbs}\n{plugins}"
+    return str((CHECKOUT if CONF.parent == CHECKOUT else Path.cwd()) / "outputs")
 
 
 # Our presets reuse the plugins' names so that the plugins validate the keys; Hydra warns.
 warnings.filterwarnings("ignore", message=r"\n'hydra/launcher/\w+' is validated against ConfigStore schema")
 OmegaConf.register_new_resolver("outputs_folder", _outputs_folder, replace=True)
-OmegaConf.register_new_resolver("help", _help, replace=True)
 # Of a Ray cluster that is started here, bytes, the least that Ray takes; a running cluster (a string) has its own.
 OmegaConf.register_new_resolver("ray_object_store", lambda address: None if address else 78_643_200, replace=True)
 

@@ -25,15 +25,13 @@ class NewConfig:
     to: Annotated[str, Field(min_length=1)] | None
 
     def __post_init__(self) -> None:
-        if len(self.named) != 1:
-            raise ConfigError(f"new: name one component, as one of {', '.join(_KINDS)}: model=mynet")
-        ((kind, name),) = self.named.items()
-        if not re.fullmatch(NAME, name):
-            raise ConfigError(f"{kind}={name}: a name is of small letters, digits and underscores, as in {kind}=mynet")
-        if (kind, name) in built_in():
-            raise ConfigError(f"{kind}={name}: is built in and is not replaced; give yours another name")
-        if self.to is None:
-            raise ConfigError(f"to: missing; write to=FOLDER, as in to=./{name}")
+        for kind, name in self.named.items():
+            if not re.fullmatch(NAME, name):
+                raise ConfigError(
+                    f"{kind}={name}: a name is of small letters, digits and underscores, as in {kind}=mynet"
+                )
+            if (kind, name) in built_in():
+                raise ConfigError(f"{kind}={name}: is built in and is not replaced; give yours another name")
 
     @property
     def named(self) -> dict[str, str]:
@@ -50,8 +48,13 @@ def _spell_out(arguments: list[str]) -> list[str]:
 def _work(asked: Asked[NewConfig]) -> Callable[[], None]:
     from atlantis_exp.sessions.beginning import begin
 
-    ((kind, name),) = asked.config.named.items()
-    return partial(begin, kind, name, Path(asked.config.to or "").expanduser())
+    config = asked.config
+    if len(config.named) != 1:
+        raise ConfigError(f"new: name one component, as one of {', '.join(KINDS)}: model=mynet")
+    ((kind, name),) = config.named.items()
+    if config.to is None:
+        raise ConfigError(f"to: missing; write to=FOLDER, as in to=./{name}")
+    return partial(begin, kind, name, Path(config.to).expanduser())
 
 
 VERB = Verb("new", NewConfig, _work, rewrite=_spell_out)

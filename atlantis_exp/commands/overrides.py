@@ -19,7 +19,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
 from atlantis_exp.checking import flatten, nearest
-from atlantis_exp.commands.composing import CONF, admit, checked, composing
+from atlantis_exp.commands import CONF
+from atlantis_exp.commands.composing import admit, checked, composing
 from atlantis_exp.components import KINDS, admitted, installed
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.launchers import BASIC, Launcher
@@ -128,6 +129,13 @@ def read_flags(arguments: Sequence[str]) -> tuple[list[str], bool]:
     """The overrides of a command line, and whether it is a sweep. Raises: ConfigError."""
     flags = _flags(arguments)
     return flags.overrides, flags.multirun
+
+
+def is_run(arguments: Sequence[str]) -> bool:
+    """Whether a command line asks for one job, not for a sweep or something to read. Raises: ConfigError."""
+    flags = _flags(arguments)
+    asked = ("multirun", "cfg", "info", "hydra_help", "shell_completion")
+    return not any(getattr(flags, each) for each in asked)
 
 
 def _flags(arguments: Sequence[str]) -> argparse.Namespace:

@@ -15,7 +15,16 @@ from atlantis_exp.checking import digest, flatten
 from atlantis_exp.comparison import published, tables
 from atlantis_exp.comparison.export_tables import to_latex, to_parquet, with_units
 from atlantis_exp.comparison.figures import draw
-from atlantis_exp.comparison.gather import COMMIT, Training, gather, group, refuse_mixed_protocols, select
+from atlantis_exp.comparison.gather import (
+    COMMIT,
+    Player,
+    Training,
+    gather,
+    group,
+    plays_alike,
+    refuse_mixed_protocols,
+    select,
+)
 from atlantis_exp.comparison.looks import read_looks, write_looks
 from atlantis_exp.comparison.report import page, plain
 from atlantis_exp.comparison.tables import Comparison
@@ -24,9 +33,10 @@ from atlantis_exp.comparison.words import spent
 from atlantis_exp.config import PathsConfig, TrackingConfig
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
-from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.runs.folder import BEST_EPISODE, RunFolder
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.tracking.publishing import publishing
+from atlantis_exp.tracking.views import how_to_open
 
 _PAGE = "comparison.html"
 
@@ -127,7 +137,9 @@ def compare(
                 journal.artifact(f"tables/{name}.parquet", to_parquet(name, table))
             journal.finish()
     _print(comparison)
-    print(f"\n{folder.artifact(_PAGE)}")
+    players = [player for player in gathered.players if plays_alike(player, trainings[0])]
+    _print_film(outputs, (*trainings, *players))
+    print(f"\n{how_to_open(outputs)}\n\n{folder.artifact(_PAGE)}")
     if COMMIT in question.by and (worse := worse_than_baseline(comparison.answers)):
         raise Fault(f"worse than the baseline {question.baseline}: {'; '.join(worse)}")
     return comparison
@@ -186,6 +198,14 @@ def _print(comparison: Comparison) -> None:
         console.print(f"- {sentence}")
     for sentence in (*reversed(comparison.others), comparison.verdict):
         console.print(f"\n{sentence}")
+
+
+def _print_film(outputs: Path, played: Sequence[Training | Player]) -> None:
+    """Say where the highest score of all can be seen, if it was filmed."""
+    best = max(played, key=lambda each: each.episodes.scores.max())
+    for place in ("runs", "evaluations"):
+        if (film := RunFolder(outputs / place / best.name).artifact(BEST_EPISODE)).exists():
+            print(f"\nthe highest score, {best.episodes.scores.max():,.0f}, as a film: {film}")
 
 
 def slug(groups: Sequence[str]) -> str:

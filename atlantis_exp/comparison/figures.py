@@ -2,7 +2,7 @@
 
 import io
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 _LINES = ("-", "--", "-.", ":")
+_HEIGHT = 3.2  # inches
+_FEW = 30  # episodes of a group, below which a histogram of 30 bins shows holes, not a shape
 _GREY = "#6e7781"  # of what is averaged over several groups
 _INK = "#24292f"  # of text and axes; a page lets it follow its own
 _STYLE = {
@@ -88,11 +90,14 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
             "rates: " + _said(groups, tables["why"], "points_per_1000_frames"),
             height=1.6 + 0.6 * len(groups),
         )
+    few = any(row["episodes"] < _FEW for row in tables["evaluation"])
     drawn["distribution"] = _render(
-        partial(_distribution, comparison=comparison),
+        partial(_strips if few else _distribution, comparison=comparison),
         "Distribution of the evaluated scores",
-        "Histogram of evaluated scores, one step line a group; medians: "
+        ("One dot an evaluated episode" if few else "Histogram of evaluated scores, one step line a group")
+        + "; medians: "
         + _said(groups, tables["evaluation"], "median"),
+        height=1.2 + 0.45 * len(groups) if few else _HEIGHT,
     )
     drawn["profile"] = _render(
         partial(_profile, comparison=comparison),
@@ -120,7 +125,7 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
     return drawn
 
 
-def _render(plot: Callable[["Axes"], None], title: str, alt: str, height: float = 3.2) -> Drawn:
+def _render(plot: Callable[["Axes"], None], title: str, alt: str, height: float = _HEIGHT) -> Drawn:
     with _style():
         from matplotlib.figure import Figure
 
@@ -192,12 +197,15 @@ def _reference_lines(draw_line: Callable[..., Any], comparison: Comparison, low:
 
 def _learning(axes: "Axes", comparison: Comparison, axis: str, rows: Table) -> None:
     seeds = [row for row in comparison.tables["seed_curves"] if row["axis"] == axis]
+    ends = {row["group"]: row["score"] for row in rows}
+    leading = sorted(ends, key=lambda group: -ends[group])[:2]  # more bands over each other show nothing
     for group in comparison.groups:
         own = [row for row in rows if row["group"] == group]
         x, score, low, high = ([row[key] for row in own] for key in ("x", "score", "low", "high"))
         look = _look(comparison.groups, group)
         axes.plot(x, score, label=group, **look)
-        axes.fill_between(x, low, high, color=look["color"], alpha=0.2, linewidth=0)
+        if group in leading:
+            axes.fill_between(x, low, high, color=look["color"], alpha=0.2, linewidth=0)
         for run in dict.fromkeys(row["run"] for row in seeds if row["group"] == group):
             points = [(row["x"], row["score"]) for row in seeds if row["run"] == run]
             axes.plot(*zip(*points, strict=True), linewidth=0.6, alpha=0.6, **look)
@@ -297,6 +305,20 @@ def _distribution(axes: "Axes", comparison: Comparison) -> None:
     axes.set_ylabel("share of episodes")
     _thousands(axes.xaxis)
     _legend(axes)
+
+
+def _strips(axes: "Axes", comparison: Comparison) -> None:
+    """A row of dots a group; equal scores are piled up."""
+    piles = Counter((row["group"], row["score"]) for row in comparison.tables["episodes"])
+    gap = min(0.08, 0.6 / max(piles.values()))
+    for (group, score), size in piles.items():
+        heights = comparison.groups.index(group) - gap * np.arange(size)
+        colour = _look(comparison.groups, group)["color"]
+        axes.plot(np.full(size, score), heights, "o", color=colour, markersize=5, alpha=0.6)
+    axes.set_yticks(range(len(comparison.groups)), comparison.groups)
+    axes.set_ylim(len(comparison.groups) - 0.4, -0.8)
+    axes.set_xlabel("score, one dot an episode")
+    _thousands(axes.xaxis)
 
 
 def _profile(axes: "Axes", comparison: Comparison) -> None:

@@ -77,11 +77,22 @@ class Training:
 
 @dataclass(frozen=True)
 class Player:
-    """A baseline or a person."""
+    """A baseline, a person or exported weights: what was not trained here."""
 
     name: str
     config: dict[str, Any]  # dotted keys
     episodes: EpisodeTable
+
+    @property
+    def called(self) -> str:
+        """How people call it."""
+        if "weights" in self.config:
+            return f"weights {self.config['weights']}"
+        if "player" in self.config:
+            return f"{self.config['player']} (human)"
+        if self.config["agent.name"] == "constant":
+            return f"{self.episodes.actions[self.config['agent.action']]} held"
+        return "random player"
 
 
 class _Later(NamedTuple):
@@ -112,20 +123,24 @@ def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None
     A training's episodes are those of its latest evaluation after its last step, be it the training's own or one that
     the verb `evaluate` made; given `epsilon`, of the latest at that epsilon. What resume=never put aside is left out
     unless it is asked for, as it is where commits are compared: it is what an earlier one made of the same recipe.
-    The name of a decision among `runs` stands for the runs that it rests on.
+    The name of a decision among `runs` stands for the runs that it rests on. Exported weights are players by their
+    latest evaluation.
     """
     patterns = [pattern for text in runs for pattern in _runs_of_decision(outputs, text) or [text]]
+
+    def is_asked_for(name: str) -> bool:
+        return not runs or any(fnmatchcase(name, f"{pattern}*") for pattern in patterns)
+
     gathered = Gathered()
-    evaluations = _evaluations(outputs, gathered.skipped)
+    evaluations, exported = _evaluations(outputs, gathered.skipped)
+    gathered.players += [player for player in exported if is_asked_for(player.name)]
     for folder in [RunFolder(path) for path in sorted((outputs / "runs").glob("*")) if path.is_dir()]:
-        if runs and not any(fnmatchcase(folder.name, f"{pattern}*") for pattern in patterns):
+        if not is_asked_for(folder.name):
             continue
         try:
             tree = _config(folder, put_aside)
             if any(key in tree for key in _PLAYERS):
-                gathered.players.append(
-                    Player(folder.name, flatten(tree), EpisodeTable.read(folder.artifact(EVALUATION)))
-                )
+                gathered.players.append(Player(folder.name, flatten(tree), _episodes(folder.artifact(EVALUATION))))
                 continue
             gathered.trainings.append(_training(folder, parse(Config, tree), evaluations.get(folder.name, []), epsilon))
         except _Unusable as error:
@@ -226,8 +241,10 @@ def _holding(holders: Mapping[str, Sequence[str]]) -> str:
 
 
 def plays_alike(player: Player, training: Training) -> bool:
-    """Whether the game is the same; a player without a network sees no crop and has no epsilon."""
-    keys = set(PROTOCOL) - {"env.crop", "evaluation.epsilon"}
+    """Whether the game is the same; a crop belongs to a network, and a player without one has no epsilon."""
+    keys = set(PROTOCOL) - {"env.crop"}
+    if "weights" not in player.config:
+        keys -= {"evaluation.epsilon"}
     return all(player.config.get(key) == training.config[key] for key in keys)
 
 
@@ -282,22 +299,36 @@ def _training(
     science = config.science()
     science["phase"] = {str(index): phase for index, phase in enumerate(science["phase"])}
     leaves = flatten(to_dict(config)) | {"evaluation.epsilon": taken}
-    episodes = EpisodeTable.read(path, facts_of(config.env.game).sources)
-    if not np.isfinite(episodes.scores).all():
-        raise ValueError(f"{path} has a score that is no finite number")
-    return Training(folder.name, leaves, flatten(science), arrays, episodes, tags, policy)
+    return Training(
+        folder.name, leaves, flatten(science), arrays, _episodes(path, facts_of(config.env.game).sources), tags, policy
+    )
 
 
-def _evaluations(outputs: Path, skipped: dict[str, str]) -> dict[str, list[_Later]]:
-    """The finished runs of the verb `evaluate` by the run that they evaluate, in the order they were made."""
+def _evaluations(outputs: Path, skipped: dict[str, str]) -> tuple[dict[str, list[_Later]], list[Player]]:
+    """The finished runs of the verb `evaluate` by the run that they evaluate, in the order they were made, and exported
+    weights, at each epsilon by the latest of theirs."""
     found: dict[str, list[_Later]] = defaultdict(list)
+    exported: dict[tuple[str, float], list[tuple[int, str, Player]]] = defaultdict(list)
     for path in sorted((outputs / "evaluations").glob(f"*/{RESULT}")):
         folder = RunFolder(path.parent)
         try:
             facts, commit = folder.config, folder.commit
-            if commit is not None and "run" in facts:  # of exported weights there is none
-                epsilon = float(facts["evaluation"]["epsilon"])
+            if commit is None:
+                continue
+            epsilon = float(facts["evaluation"]["epsilon"])
+            if "run" in facts:
                 found[str(facts["run"])].append(_Later(commit.updated, int(facts["step"]), epsilon, folder))
+            elif "weights" in facts:
+                player = Player(folder.name, flatten(facts), _episodes(folder.artifact(EVALUATION)))
+                exported[str(facts["sha256"]), epsilon].append((commit.updated, folder.name, player))
         except (Fault, ValueError, KeyError, TypeError, OSError) as error:
             skipped[f"evaluations/{folder.name}"] = f"broken: {type(error).__name__}: {error}"
-    return {run: sorted(later, key=lambda each: each.made) for run, later in found.items()}
+    trainings = {run: sorted(later, key=lambda each: each.made) for run, later in found.items()}
+    return trainings, [max(made)[-1] for made in exported.values()]
+
+
+def _episodes(path: Path, sources: Sequence[str] = ()) -> EpisodeTable:
+    episodes = EpisodeTable.read(path, sources)
+    if not np.isfinite(episodes.scores).all():
+        raise ValueError(f"{path} has a score that is no finite number")
+    return episodes

@@ -205,6 +205,13 @@ def capped(facts: Facts) -> Iterator[str]:
         )
 
 
+def measured_players(facts: Facts) -> Iterator[str]:
+    """What was not trained here and played the same game."""
+    if players := [row for row in facts.tables["references"] if row["name"].endswith(", measured")]:
+        scores = [f"{row['name'].removesuffix(', measured')} {row['score']:,.0f}" for row in players]
+        yield f"In the same game, on average: {', '.join(scores)}."
+
+
 def other_players(facts: Facts) -> Iterator[str]:
     """What the random player's line is worth."""
     if (random_player := random_line(facts.tables["references"])) is None:
@@ -221,18 +228,16 @@ def other_players(facts: Facts) -> Iterator[str]:
 
 
 BESIDE: Sequence[Callable[[Facts], Iterator[str]]] = (
-    *(
-        collapsed,
-        equal_within,
-        equal_across,
-        modes_found,
-        different_makers,
-        lossy,
-        uncommitted,
-        unbalanced,
-        later_seeds,
-        unplanned,
-    ),
+    collapsed,
+    equal_within,
+    equal_across,
+    modes_found,
+    different_makers,
+    lossy,
+    uncommitted,
+    unbalanced,
+    later_seeds,
+    unplanned,
 )
 """What is said beside the verdict, since it can make it mean something else."""
 
@@ -242,6 +247,7 @@ NOTES: Sequence[Callable[[Facts], Iterator[str]]] = (
     survival_and_rate,
     missing_views,
     capped,
+    measured_players,
     other_players,
 )
 """What is said after it."""

@@ -15,7 +15,13 @@ def page(comparison: Comparison, figures: Mapping[str, Drawn], facts: Mapping[st
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
     template = environment.from_string((files("atlantis_exp.comparison") / "page.html").read_text("utf-8"))
     return template.render(
-        comparison=comparison, tables=comparison.tables, figures=figures, facts=facts, titles=titles, cells=cells
+        comparison=comparison,
+        tables=comparison.tables,
+        figures=figures,
+        facts=facts,
+        titles=titles,
+        cells=cells,
+        explained=EXPLAINED,
     )
 
 
@@ -121,6 +127,32 @@ COLUMNS = {
     "skipped": {"run": "run", "reason": "why it is left out"},
 }
 """The tables that the page shows: their columns and how a person calls them."""
+
+EXPLAINED = {
+    "by": "the key whose values are compared, averaged over the others",
+    "score": "of a seed: the interquartile mean of its evaluated episodes; of a group: the mean over its seeds",
+    "seeds each": "seeds of each of the two groups that the verdict rests on",
+    "verdict": "better, worse, equivalent within delta, or not decided",
+    "look": "a planned glance at the seeds so far, which spends a share of the error",
+    "error spent": "the share of the allowed probability of a false verdict that the looks have used up",
+    "of": "the allowed probability of any false verdict, over all pairs and looks",
+    "points per frame": "all points of the episodes over all their emulator frames, which no time cap distorts",
+    "points per 1,000 frames": "1,000 times all points of the episodes over all their emulator frames",
+    "at time cap": "the share of episodes that the limit of frames or steps ended",
+    "episodes at time cap": "the share of episodes that the limit of frames or steps ended",
+    "human-normalised": "0 % is the published random player, 100 % the published human",
+    "probability of improvement": "of an episode of the group and one of the other, how often the first scores higher",
+    "in the upper mode": "the share of seeds that survive where seeds fall into two modes",
+    "FLOPs": "floating-point operations of all gradient updates",
+    "epsilon": "the share of actions left to chance in evaluation",
+    "policy": "the action that the network chose most in evaluation; collapsed: it chose one only",
+    "counts as one with": "a run with the same score in every episode",
+    "chance": "the share of steps whose action was drawn at random",
+    "by chance": "the share of equal actions if both chose independently, each as often as it does",
+    "distance of advantages": "the mean difference of normalised action values: 0 if equal, about 1.1 if unrelated",
+    "rank correlation of state values": "Spearman's, of the highest action values over the states",
+}
+"""What a header's term means, in a sentence."""
 
 _SHARES = {
     *("time_cap_share", "upper_share", "probability", "network", "random", "human_normalised_mean"),

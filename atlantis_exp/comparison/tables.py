@@ -382,15 +382,9 @@ def _episodes(label: str, training: Training) -> Table:
 
 
 def _measured(player: Player) -> Row:
-    scores, config = player.episodes.scores, player.config
-    if "player" in config:
-        name = f"{config['player']} (human)"
-    elif config["agent.name"] == "constant":
-        name = f"{player.episodes.actions[config['agent.action']]} held"
-    else:
-        name = "random player"
+    scores = player.episodes.scores
     return {
-        "name": f"{name}, measured",
+        "name": f"{player.called}, measured",
         "score": float(scores.mean()),
         "kind": "player",
         "protocol": f"{scores.size} episodes under the runs' own settings",

@@ -27,11 +27,20 @@ class Step(NamedTuple):
     points: list[float]  # the reward by its source, in the order of the game's sources
 
 
+def check_game(game: Game) -> None:
+    """Raise ConfigError where ALE has no such ROM, or other actions for it."""
+    if game.rom not in get_all_rom_ids():
+        raise ConfigError(f"{game.rom}: ALE has no ROM of that name")
+    ale = ALEInterface()
+    ale.loadROM(cast(Path, get_rom_path(game.rom)))
+    if (actions := tuple(action.name for action in ale.getMinimalActionSet())) != game.actions:
+        raise ConfigError(f"{game.rom}: actions = {game.actions}: should be ALE's, {actions}")
+
+
 class Emulator:
     """One game, from frames to observations; before its first seed it plays as if seeded with 0.
 
-    game: its ROM, its actions, of which an action is an index, and what pays its points. Raises ConfigError where ALE
-        has no such ROM, or other actions.
+    game: its ROM, its actions, of which an action is an index, and what pays its points.
     frameskip: frames in a step, or (low, high): drawn from low to high - 1 in every step, as in the report.
     sticky: probability that a frame repeats the action of the one before (Machado et al., 2018).
     max_frames: frames after which an episode is truncated.
@@ -64,10 +73,7 @@ class Emulator:
         self._ale = ALEInterface()
         self._ale.setFloat("repeat_action_probability", sticky)
         self._ale.setInt("max_num_frames_per_episode", max_frames)
-        self._load_game(seed=0)
-        self._actions = self._ale.getMinimalActionSet()
-        if (actions := tuple(action.name for action in self._actions)) != game.actions:
-            raise ConfigError(f"{game.rom}: actions = {game.actions}: should be ALE's, {actions}")
+        self._is_loaded = False  # which takes as long as a thousand frames, and a seed needs it anew
         self._steps = 0
         self._screen: Pixels = np.zeros((SCREEN_HEIGHT, SCREEN_WIDTH), np.uint8)
         self._pool = preprocessing.grey(self._screen)  # of the last step, cropped; max_pool only
@@ -88,8 +94,8 @@ class Emulator:
 
     def reset(self, seed: int | None = None) -> Pixels:
         """Begins an episode and returns its first observation; without a seed the random streams go on."""
-        if seed is not None:
-            self._load_game(seed)
+        if seed is not None or not self._is_loaded:
+            self._load_game(seed or 0)
         self._keep_origin()
         self._begun = True
         self._ale.reset_game()
@@ -143,6 +149,8 @@ class Emulator:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Plays the episode again up to where it was: a second for some 4,000 steps."""
+        if not self._is_loaded:
+            self._load_game(0)
         self._ale.restoreState(ALEState(state["ale"].tobytes()))
         self._generator.bit_generator.state = state["generator"]
         self._keep_origin()
@@ -156,9 +164,9 @@ class Emulator:
         own_seed, ale_seed = np.random.SeedSequence(seed).generate_state(2)
         self._generator = np.random.default_rng(own_seed)
         self._ale.setInt("random_seed", ale_seed.astype(np.int32))
-        if self.game.rom not in get_all_rom_ids():
-            raise ConfigError(f"{self.game.rom}: ALE has no ROM of that name")
         self._ale.loadROM(cast(Path, get_rom_path(self.game.rom)))
+        self._actions = self._ale.getMinimalActionSet()
+        self._is_loaded = True
         self._keep_origin()
 
     def _keep_origin(self) -> None:

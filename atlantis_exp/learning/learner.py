@@ -1,28 +1,25 @@
 """The learner: two networks, an optimizer, and the update that moves them."""
 
 import copy
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from atlantis_exp.learning.objectives import Objective, action_values, td_errors
+from atlantis_exp.learning.objectives import Objective, td_errors
+from atlantis_exp.learning.values import ActionValues, Replicas, generators_of
 
 _MEASURES = ("loss", "q", "target", "gradient_norm")
 _AVERAGE_EVERY = 10  # updates, since an average of weights moves as much memory as the optimizer does
 
-_Shards = list[Sequence[Any]]
 
-
-class Learner:
+class Learner(ActionValues):
     """Learns action values by gradient steps on `network`, which `target` follows by a share `tau` (report figure 2.5).
 
     `target` moves after every `target_every` updates: with tau below 1 it follows softly, with tau 1 it is a copy.
@@ -64,30 +61,22 @@ class Learner:
         ema: int | None = None,
         compile: Callable[[nn.Module], nn.Module] | None = None,
     ) -> None:
-        self.network = network.eval()
+        super().__init__(network, precision=precision, shards=shards)
         self.target = target.train(target_mode == "train")
         self.optimizer = optimizer
         self.objective = objective
         self.tau = tau  # share of the network that enters the target network
         self.target_every = target_every  # updates
-        self.dtype = torch.bfloat16 if precision == "bf16" else torch.float32
-        if shards > 1 and not getattr(network, "splits_batches", False):
-            raise ValueError("the network does not say splits_batches, so a batch is not split into shards")
-        self.shards = shards
-        self._online = _Replicas(network, self.dtype, shards)
-        self._target = _Replicas(target, self.dtype, shards)
+        self._target = Replicas(target, self.dtype, shards)
         self.ema = ema  # updates
         self.evaluated = copy.deepcopy(network) if ema else network
-        self._evaluated = _Replicas(self.evaluated, self.dtype, shards) if ema else self._online
+        self._evaluated = Replicas(self.evaluated, self.dtype, shards) if ema else self._online
         self._online_passes, self._target_passes = (
             [compile(network) for network in replicas.networks] if compile else replicas.networks
             for replicas in (self._online, self._target)
         )
-        if shards > 1:
-            self._threads = ThreadPoolExecutor(shards, "learner", partial(torch.set_num_threads, 1))
         self.target_mode = target_mode
         self.updates = 0
-        self.device = next(network.parameters()).device
         self._sums = torch.zeros(len(_MEASURES), device=self.device)
         self._measured = 0  # updates in the sums
         self._first_nonfinite = torch.full((), -1, device=self.device)
@@ -163,32 +152,9 @@ class Learner:
         means = torch.stack((loss.detach(), share * q.mean(), share * target.mean()))
         return gradients, means, td_errors(q, actions, target)
 
-    def q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
-        """Return the network's values (B, A) of states (B, C, H, W) in 0..255; changes nothing."""
-        return self._all_values(self._online, states)
-
     def evaluated_q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
         """Return the values (B, A) of `evaluated` of states (B, C, H, W) in 0..255; changes nothing."""
-        return self._all_values(self._evaluated, states)
-
-    def _all_values(self, replicas: "_Replicas", states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
-        shards = self._shards(states)
-        return np.concatenate([*self._each(shards)(partial(self._values, replicas), *shards)])
-
-    @torch.inference_mode()
-    def _values(self, replicas: "_Replicas", shard: int, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
-        q = replicas.networks[shard](self._input(states)).float()
-        values: npt.NDArray[np.float32] = action_values(q).cpu().numpy()
-        return values
-
-    def _shards(self, *batch: npt.NDArray[Any]) -> "_Shards":
-        """Return the shards' numbers, then each array of a batch in as many parts, none of them empty."""
-        count = min(self.shards, len(batch[0]))
-        return [range(count), *(np.array_split(array, count) for array in batch)]
-
-    def _each(self, shards: "_Shards") -> Callable[..., Iterable[Any]]:
-        """Return what maps a function over shards: in a thread each, one alone in this one."""
-        return map if len(shards[0]) == 1 else self._threads.map
+        return self.all_values(self._evaluated, states)
 
     @property
     def learning_rate(self) -> float:
@@ -284,19 +250,6 @@ class Learner:
         self._online.refresh()
         self._target.refresh()
 
-    def _input(self, states: npt.NDArray[np.uint8]) -> torch.Tensor:
-        """Return states in [0, 1] in the precision of the forward pass, channels last."""
-        batch, channels, height, width = states.shape
-        # Channels move while they are bytes, by OpenCV: torch takes longer than for all the rest of this.
-        bytes_BHWC = cv2.merge([states[:, channel].reshape(-1, width) for channel in range(channels)])
-        x_BHWC = self._sent(bytes_BHWC.reshape(batch, height, width, channels))
-        return x_BHWC.to(self.dtype).div_(255).permute(0, 3, 1, 2)
-
-    def _sent(self, array: npt.NDArray[Any]) -> torch.Tensor:
-        tensor = torch.from_numpy(array)
-        # From memory that may be paged out, a copy to a GPU waits for all that was asked of the GPU before.
-        return tensor.pin_memory().to(self.device, non_blocking=True) if self.device.type == "cuda" else tensor
-
     def _measure(self, means: torch.Tensor) -> None:
         gradient_norm = nn.utils.get_total_norm([p.grad for p in self.network.parameters() if p.grad is not None])
         self._sums += torch.cat((means, gradient_norm.unsqueeze(0)))
@@ -309,15 +262,8 @@ class Learner:
         return {
             f"{role}.{name}": generator
             for role, network in (("network", self.network), ("target", self.target))
-            for name, generator in _generators(network)
+            for name, generator in generators_of(network)
         }
-
-
-def _generators(network: nn.Module) -> Iterator[tuple[str, torch.Generator]]:
-    """Yield whatever the modules of a network hold as `generator`."""
-    for name, module in network.named_modules():
-        if isinstance(generator := getattr(module, "generator", None), torch.Generator):
-            yield name, generator
 
 
 @torch.no_grad()
@@ -330,39 +276,3 @@ def _follow(follower: nn.Module, leader: nn.Module, share: float, *, buffers: bo
                 running.lerp_(latest, share)
             else:
                 running.copy_(latest)
-
-
-class _Replicas:
-    """Copies of a network for a thread each, which share buffers, generators and weights in the precision of the pass.
-
-    In bfloat16 these are the weights of layers with matrices; what normalises stays float32. `refresh` them when the
-    network's own have moved.
-    """
-
-    def __init__(self, network: nn.Module, dtype: torch.dtype, count: int) -> None:
-        with_matrices = [
-            parameter
-            for module in network.modules()
-            if any(parameter.ndim > 1 for parameter in module.parameters(recurse=False))
-            for parameter in module.parameters(recurse=False)
-        ]
-        self._masters: list[torch.Tensor] = [*with_matrices] if dtype is torch.bfloat16 else []
-        self._casts = [parameter.detach().to(dtype) for parameter in self._masters]
-        if not self._casts and count == 1:
-            self.networks = [network]
-            return
-        weights = {id(parameter): parameter.detach() for parameter in network.parameters()}
-        weights |= {id(master): cast for master, cast in zip(self._masters, self._casts, strict=True)}
-        shared = [*network.buffers(), *(generator for _, generator in _generators(network))]
-        self.networks = [
-            copy.deepcopy(
-                network,
-                {id(each): each for each in shared} | {key: nn.Parameter(weight) for key, weight in weights.items()},
-            )
-            for _ in range(count)
-        ]
-
-    @torch.no_grad()
-    def refresh(self) -> None:
-        if self._casts:
-            torch._foreach_copy_(self._casts, self._masters)

@@ -7,14 +7,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, Self, TypeVar
 
-from pydantic import TypeAdapter
-
 from atlantis_exp.checking import nearest, parse
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.runs import lock
-from atlantis_exp.runs.files import SMALL, inside, read_file, write_file
+from atlantis_exp.runs.files import SMALL, inside, read_file, schema_of, write_file
 from atlantis_exp.runs.journal import Commit, Status, read_commit
 
 CONFIG, RESULT, COMMIT = "config.json", "result.json", "commit.json"
@@ -97,7 +95,7 @@ class RunFolder:
     @property
     def config(self) -> dict[str, Any]:
         """The composed config, empty before the run's start."""
-        return _read(self.path / CONFIG, _CONFIG) or {}
+        return _read(self.path / CONFIG, dict[str, Any]) or {}
 
     @property
     def trained_config(self) -> Config:
@@ -110,7 +108,7 @@ class RunFolder:
     @property
     def result(self) -> Result | None:
         """How the run ended, None before its end."""
-        return _read(self.path / RESULT, _RESULT)
+        return _read(self.path / RESULT, Result)
 
     def ended(self, budget: int | None) -> Result | None:
         """How the run has ended, None if it goes on: it has not, or did by its budget of steps and has now a larger."""
@@ -202,12 +200,8 @@ def find_run(outputs: Path, name: str) -> RunFolder:
     raise ConfigError(f"run={name}: no such run; {nearest(name, {folder.name for folder in folders})}")
 
 
-def _read(path: Path, schema: TypeAdapter[T]) -> T | None:
+def _read(path: Path, kind: type[T]) -> T | None:
     try:
-        return schema.validate_json(read_file(path, SMALL), strict=True) if path.exists() else None
+        return schema_of(kind).validate_json(read_file(path, SMALL), strict=True) if path.exists() else None
     except ValueError:
         raise Fault(f"{path} is damaged: remove it and issue the run's command again, which writes it anew") from None
-
-
-_RESULT = TypeAdapter(Result)
-_CONFIG = TypeAdapter(dict[str, Any])

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal, Protocol, get_args
 from uuid import uuid4
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from atlantis_exp.faults import Fault
-from atlantis_exp.runs.files import SMALL, inside, no_link, open_file, read_file, read_object, write_file
+from atlantis_exp.runs.files import SMALL, inside, no_link, open_file, read_file, read_object, schema_of, write_file
 
 Status = Literal["SCHEDULED", "RUNNING", "FINISHED", "FAILED", "KILLED"]
 NOTE = "mlflow.note.content"
@@ -82,7 +82,7 @@ class Model:
 
 
 Record = Metrics | Params | Tags | Artifact | Image | Model
-_KINDS: dict[str, TypeAdapter[Record]] = {kind.__name__.lower(): TypeAdapter(kind) for kind in get_args(Record)}
+_KINDS: dict[str, type[Record]] = {kind.__name__.lower(): kind for kind in get_args(Record)}
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,6 @@ class JournalError(Fault, ValueError):
     """A journal that cannot be continued from."""
 
 
-_COMMIT = TypeAdapter(Commit)
 _POINT_BYTES = 2_000  # between two points of a curve that are worth reading; three lines of a journal, or so
 
 
@@ -299,7 +298,7 @@ def read_commit(folder: Path) -> Commit | None:
 def commit_of(content: bytes) -> Commit:
     """Returns the commit that the bytes of a `commit.json` say. Raises: JournalError."""
     try:
-        return _COMMIT.validate_json(content, strict=True)
+        return schema_of(Commit).validate_json(content, strict=True)
     except ValidationError:
         raise JournalError("this is no commit.json") from None
 
@@ -370,7 +369,7 @@ def record_of(line: bytes, where: str) -> Record:
     """The record that a line of a journal holds. Raises: ValueError, saying where."""
     try:
         fields = read_object(line)
-        return _KINDS[fields.pop("kind")].validate_python(fields)
+        return schema_of(_KINDS[fields.pop("kind")]).validate_python(fields)
     except (ValueError, KeyError, TypeError):  # among them pydantic's, of several lines
         raise ValueError(f"{where}: no record of a journal: {line[:60]!r}") from None
 

@@ -9,6 +9,7 @@ from atlantis_exp.config import PathsConfig
 from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.runs.folder import all_runs
 from atlantis_exp.tracking.publishing import catch_up
+from atlantis_exp.tracking.views import how_to_open
 
 
 def report(*, paths: PathsConfig) -> None:
@@ -42,4 +43,4 @@ def report(*, paths: PathsConfig) -> None:
     for run in runs:
         if run.result is not None:
             console.print(f"\n{run.name}\n{run.result.report}")
-    console.print(f"\nthe MLflow UI: make ui, or python -m atlantis_exp ui paths.outputs={shown}")
+    console.print(f"\n{how_to_open(outputs)}")

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import emulation, kills, learner, overhead, replay, store, training
+from benchmarks import emulation, kills, learner, overhead, replay, startup, store, training
 from benchmarks.contest import paired_ratio, ratio, take_turns
 
 Main = Callable[[Sequence[str]], None]
@@ -126,3 +126,11 @@ def test_store_measures_every_command_over_many_runs(
 @pytest.mark.slow
 def test_kills_counts_them_and_finds_no_difference(capsys: pytest.CaptureFixture[str]) -> None:
     assert results_of(kills.main, "--kills 2 --only prioritized", capsys) == {"kills": 2, "differences": []}
+
+
+@pytest.mark.slow
+def test_startup_relates_each_command_to_importing_torch(capsys: pytest.CaptureFixture[str]) -> None:
+    results = results_of(startup.main, "--rounds 1", capsys)
+    assert {*startup.TARGETS} < {*results}
+    assert all(share > 0 for share in results.values())
+    assert results["help"] < 1

@@ -30,6 +30,8 @@ Command = Callable[..., int]
         "seed=1 seed=2 paths.outputs=o",
         "replay.capacity=1000000000000000000 paths.outputs=o",
         "device=cuda:99 paths.outputs=o",
+        "new to=o",
+        "new model=mynet",
     ],
 )
 def test_a_mistake_ends_with_code_2_and_one_line_and_leaves_nothing_behind(

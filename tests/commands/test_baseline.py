@@ -4,8 +4,9 @@ from pathlib import Path
 
 from hydra import compose, initialize_config_dir
 
+from atlantis_exp.commands import CONF
 from atlantis_exp.commands.baseline import BaselineConfig
-from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.commands.composing import checked
 
 
 def composed(outputs: Path, *overrides: str) -> BaselineConfig:

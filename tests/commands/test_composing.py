@@ -8,7 +8,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from atlantis_exp.checking import flatten, parse, to_dict
-from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.commands import CONF
+from atlantis_exp.commands.composing import checked
 from atlantis_exp.config import Config
 
 GROUPS = {path.name: sorted(file.stem for file in path.glob("*.yaml")) for path in CONF.iterdir() if path.is_dir()}

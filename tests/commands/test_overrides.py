@@ -200,8 +200,6 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("export weights=pretrained/fast", "weights=pretrained/fast", "best, latest"),
     ("export too=pretrained/fast", "too=pretrained/fast", "'to'"),
     ("report paths.output=x", "paths.output", "'paths.outputs'"),
-    ("new component.model=mynet", "to", "to=FOLDER"),
-    ("new to=x", "new", "one of model, sampler"),
     ("new component.model=cnn to=x", "model=cnn", "built in"),
     ("new component.model=MyNet to=x", "model=MyNet", "small letters"),
     ("ui port=80", "port=80", "greater than or equal to 1024"),

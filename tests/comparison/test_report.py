@@ -14,7 +14,7 @@ from PIL import Image
 
 from atlantis_exp.comparison.figures import Drawn, draw
 from atlantis_exp.comparison.gather import gather, group
-from atlantis_exp.comparison.report import number, page
+from atlantis_exp.comparison.report import COLUMNS, EXPLAINED, number, page
 from atlantis_exp.comparison.tables import Comparison, compare
 from atlantis_exp.comparison.verdict import Question
 
@@ -103,6 +103,43 @@ def test_the_page_says_the_verdict_the_notes_and_every_shown_table(
         assert row["name"] in text
 
 
+def test_a_term_in_a_header_is_explained_and_nothing_else_is(comparison: Comparison, figures: dict[str, Drawn]) -> None:
+    shown = {title for columns in COLUMNS.values() for title in columns.values()}
+    assert set(EXPLAINED) <= shown
+    assert {"score", "human-normalised", "probability of improvement", "FLOPs"} <= set(EXPLAINED)
+    headers = [attributes for tag, attributes in Tags(page(comparison, figures, {})).found if tag == "th"]
+    said = {attributes["title"] for attributes in headers if "title" in attributes}
+    assert EXPLAINED["probability of improvement"] in said
+    assert len(said) < len(headers)
+
+
+@pytest.mark.slow
+def test_few_episodes_are_dots_and_many_a_histogram(recorded: Recorded, tmp_path: Path) -> None:
+    def drawn() -> Drawn:
+        gathered = gather(tmp_path)
+        return draw(compare(gathered, group(gathered.trainings, ["model"]), Question(["model"])))["distribution"]
+
+    recorded(scores=[100.0] * 10 + [float(score) for score in range(10, 29)])
+    few = drawn()
+    assert few.alt.startswith("One dot an evaluated episode")
+    assert few.svg.count("<use ") > 29  # a marker each, and ticks
+    recorded("seed=1", scores=[100.0])
+    many = drawn()
+    assert many.alt.startswith("Histogram")
+
+
+@pytest.mark.slow
+def test_two_bands_at_most_lie_over_each_other(recorded: Recorded, tmp_path: Path) -> None:
+    for index, model in enumerate(("cnn", "resnet", "resnet_fast")):
+        for seed in range(5):
+            points = [(0, 0, 0, 1_000 + seed), (600, 0.5, 30, 2_000 + 1_000 * index + 10 * seed)]
+            recorded(f"model={model}", f"seed={seed}", curve=points)
+    gathered = gather(tmp_path)
+    figures = draw(compare(gathered, group(gathered.trainings, ["model"]), Question(["model"])))
+    bands = set(re.findall(r'id="(?:FillBetween)?PolyCollection_\d+"', figures["learning_frames"].svg))
+    assert len(bands) == 2
+
+
 @pytest.mark.parametrize(
     ("value", "column", "text"),
     [
@@ -150,8 +187,10 @@ def test_the_same_comparison_draws_the_same_figures(comparison: Comparison) -> N
 def test_a_comparison_without_curves_has_the_other_figures(recorded: Recorded, tmp_path: Path) -> None:
     recorded(curve=())
     gathered = gather(tmp_path)
-    figures = draw(compare(gathered, group(gathered.trainings, ["model"]), Question(["model"])))
+    comparison = compare(gathered, group(gathered.trainings, ["model"]), Question(["model"]))
+    figures = draw(comparison)
     assert list(figures) == ["scores", "why", "distribution", "profile", "actions", "references"]
+    assert "three fair views" not in page(comparison, figures, {})
 
 
 def test_comparing_loads_no_torch() -> None:

@@ -2,6 +2,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Sequence, Set
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -284,6 +285,27 @@ def test_a_pool_restored_before_an_unfinished_step_is_the_one_saved() -> None:
     step = ours.step(0)
     assert step.frames == 2
     np.testing.assert_array_equal(restored.step(0).observation, step.observation)
+
+
+def test_the_game_is_loaded_once_a_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes ALE a fifth of a second."""
+    loaded = []
+
+    def path_of(game: str) -> Path | None:
+        loaded.append(game)
+        return get_rom_path(game)
+
+    monkeypatch.setattr("atlantis_exp.game.emulator.get_rom_path", path_of)
+    ours = emulator()
+    assert loaded == []
+    ours.reset(seed=1)
+    ours.reset()
+    state = ours.state_dict()
+    assert len(loaded) == 1
+    unseeded, seeded, restored = emulator(), emulator(), emulator()
+    assert (unseeded.reset() == seeded.reset(seed=0)).all()
+    restored.load_state_dict(state)
+    assert len(loaded) == 4
 
 
 def test_it_is_silent() -> None:

@@ -103,6 +103,7 @@ def _nothing_is_admitted_afterwards() -> Iterator[None]:
     admit([])
 
 
+@pytest.mark.thinned(3)
 @pytest.mark.parametrize(("part", "instead", "contracts"), BREACHES, ids=[instead for _, instead, _ in BREACHES])
 def test_a_breach_is_named(
     part: str, instead: str, contracts: tuple[str, ...], tmp_path: Path, tiny_overrides: tuple[str, ...]

@@ -14,8 +14,9 @@ import mlflow
 import pytest
 from hydra import compose, initialize_config_dir
 
+from atlantis_exp.commands import CONF
 from atlantis_exp.commands.baseline import BaselineConfig
-from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.commands.composing import checked
 from atlantis_exp.commands.play import PlayConfig
 from atlantis_exp.comparison.gather import gather
 from atlantis_exp.faults import Fault

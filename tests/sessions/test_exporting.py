@@ -1,6 +1,7 @@
 """Exported weights: what a folder of them holds, and when there is none."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
+from atlantis_exp.comparison.gather import gather, plays_alike
 from atlantis_exp.config import Config
 from atlantis_exp.sessions import cards
 from atlantis_exp.sessions.cards import read_card
@@ -60,7 +62,19 @@ def test_exported_weights_score_what_their_card_says(
     (recorded,) = (trained / "evaluations").iterdir()
     facts = json.loads((recorded / "config.json").read_text())
     assert (facts["sha256"], facts["evaluation"]["num_envs"]) == (card.sha256, 1)
-    assert (recorded / "artifacts" / "best_episode.mp4").stat().st_size > 1_000
+    film = recorded / "artifacts" / "best_episode.mp4"
+    assert film.stat().st_size > 1_000
+
+    # What was trained here is shown with them where they played the same game at the same epsilon.
+    assert command("evaluate", *played, "epsilon=0.05", "episodes=2", "evaluation.video=false") == 0
+    gathered = gather(trained)
+    (training,) = gathered.trainings
+    alike = {player.config["evaluation.epsilon"]: plays_alike(player, training) for player in gathered.players}
+    assert alike == {0.9: False, 0.05: True}
+    assert {player.called for player in gathered.players} == {"weights tiny"}
+    capsys.readouterr()
+    assert command("compare", f"paths.outputs={trained}", "tracking=none") == 0
+    assert re.search(r"In the same game, on average: weights tiny [\d,]+\.", capsys.readouterr().out)
 
 
 def test_an_export_neither_overwrites_nor_starts_without_weights(

@@ -3,7 +3,8 @@
 import pytest
 from hydra import compose, initialize_config_dir
 
-from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.commands import CONF
+from atlantis_exp.commands.composing import checked
 from atlantis_exp.commands.query import QueryConfig
 from atlantis_exp.sessions.querying import query
 

@@ -39,7 +39,8 @@ def searching(tmp_path: Path, tiny_overrides: tuple[str, ...]) -> "Callable[...,
     """A search as a command line asks for it: `searching("trials=3", space=SPACE)`."""
 
     def asked(*overrides: str, space: tuple[str, ...] = SPACE) -> Request:
-        fixed = tuple(replaced(tiny_overrides, *SHORT, f"paths.outputs={tmp_path}", *overrides))
+        short = replaced(tiny_overrides, *SHORT, f"paths.outputs={tmp_path}")
+        fixed = tuple(replaced(short, *overrides))
         ((texts, config),) = check("search", SearchConfig, fixed).items()
         return request_of(Asked(config, "search", texts, typed=(*fixed, *space)))
 
@@ -116,6 +117,7 @@ def test_a_trial_that_nobody_holds_goes_on_before_a_new_one_is_drawn(searching: 
         assert new.params != trial.params
 
 
+@pytest.mark.thinned(3)
 @pytest.mark.parametrize(
     "line",
     [

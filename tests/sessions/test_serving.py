@@ -17,7 +17,8 @@ from typing import Any
 import pytest
 from hydra import compose, initialize_config_dir
 
-from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.commands import CONF
+from atlantis_exp.commands.composing import checked
 from atlantis_exp.config import Config
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job

@@ -19,7 +19,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from mlflow.store.entities import PagedList
 
-from atlantis_exp.commands.composing import CONF, checked
+from atlantis_exp.commands import CONF
+from atlantis_exp.commands.composing import checked
 from atlantis_exp.commands.sync import SyncConfig
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import write_file
@@ -127,6 +128,7 @@ def shown(root: Path, run: str) -> dict[str, Any]:
     }
 
 
+@pytest.mark.slow
 def test_runs_go_to_a_server_and_come_back_equal_and_once_and_then_what_is_new(
     tmp_path: Path, server: tuple[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -347,7 +349,9 @@ def test_every_folder_of_the_outputs_is_published_and_stays_at_home(tmp_path: Pa
 @pytest.mark.slow
 def test_it_goes_on_looking_until_it_is_interrupted(outputs: Path) -> None:
     command = (sys.executable, "-m", "atlantis_exp", "sync", "every=1s", f"paths.outputs={outputs}")
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background job lacks
     looking = subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    signal.signal(signal.SIGINT, before)
     try:
         assert looking.stdout is not None
         assert looking.stdout.readline().endswith("mlflow.db: 0 runs\n")

@@ -1,0 +1,115 @@
+"""A network's action values, computed on all cores."""
+
+import copy
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import nn
+
+from atlantis_exp.learning.objectives import action_values
+
+Shards = list[Sequence[Any]]
+
+
+def generators_of(network: nn.Module) -> Iterator[tuple[str, torch.Generator]]:
+    """Yield whatever the modules of a network hold as `generator`."""
+    for name, module in network.named_modules():
+        if isinstance(generator := getattr(module, "generator", None), torch.Generator):
+            yield name, generator
+
+
+class Replicas:
+    """Copies of a network for a thread each, which share buffers, generators and weights in the precision of the pass.
+
+    In bfloat16 these are the weights of layers with matrices; what normalises stays float32. `refresh` them when the
+    network's own have moved.
+    """
+
+    def __init__(self, network: nn.Module, dtype: torch.dtype, count: int) -> None:
+        with_matrices = [
+            parameter
+            for module in network.modules()
+            if any(parameter.ndim > 1 for parameter in module.parameters(recurse=False))
+            for parameter in module.parameters(recurse=False)
+        ]
+        self._masters: list[torch.Tensor] = [*with_matrices] if dtype is torch.bfloat16 else []
+        self._casts = [parameter.detach().to(dtype) for parameter in self._masters]
+        if not self._casts and count == 1:
+            self.networks = [network]
+            return
+        weights = {id(parameter): parameter.detach() for parameter in network.parameters()}
+        weights |= {id(master): cast for master, cast in zip(self._masters, self._casts, strict=True)}
+        shared = [*network.buffers(), *(generator for _, generator in generators_of(network))]
+        self.networks = [
+            copy.deepcopy(
+                network,
+                {id(each): each for each in shared} | {key: nn.Parameter(weight) for key, weight in weights.items()},
+            )
+            for _ in range(count)
+        ]
+
+    @torch.no_grad()
+    def refresh(self) -> None:
+        if self._casts:
+            torch._foreach_copy_(self._casts, self._masters)
+
+
+class ActionValues:
+    """Asks a network, in eval mode and on the device where it lies, what actions are worth.
+
+    precision and shards are as a learner's; raises ValueError for several shards unless the network's class says
+    `splits_batches`.
+    """
+
+    def __init__(self, network: nn.Module, *, precision: Literal["fp32", "bf16"] = "fp32", shards: int = 1) -> None:
+        self.network = network.eval()
+        self.dtype = torch.bfloat16 if precision == "bf16" else torch.float32
+        self.device = next(network.parameters()).device
+        if shards > 1 and not getattr(network, "splits_batches", False):
+            raise ValueError("the network does not say splits_batches, so a batch is not split into shards")
+        self.shards = shards
+        if shards > 1:
+            self._threads = ThreadPoolExecutor(shards, "learner", partial(torch.set_num_threads, 1))
+        self._online = Replicas(network, self.dtype, shards)
+
+    def q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+        """Return the network's values (B, A) of states (B, C, H, W) in 0..255; changes nothing."""
+        return self.all_values(self._online, states)
+
+    def all_values(self, replicas: Replicas, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+        shards = self._shards(states)
+        return np.concatenate([*self._each(shards)(partial(self._values, replicas), *shards)])
+
+    @torch.inference_mode()
+    def _values(self, replicas: Replicas, shard: int, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+        q = replicas.networks[shard](self._input(states)).float()
+        values: npt.NDArray[np.float32] = action_values(q).cpu().numpy()
+        return values
+
+    def _shards(self, *batch: npt.NDArray[Any]) -> Shards:
+        """Return the shards' numbers, then each array of a batch in as many parts, none of them empty."""
+        count = min(self.shards, len(batch[0]))
+        return [range(count), *(np.array_split(array, count) for array in batch)]
+
+    def _each(self, shards: Shards) -> Callable[..., Iterable[Any]]:
+        """Return what maps a function over shards: in a thread each, one alone in this one."""
+        return map if len(shards[0]) == 1 else self._threads.map
+
+    def _input(self, states: npt.NDArray[np.uint8]) -> torch.Tensor:
+        """Return states in [0, 1] in the precision of the forward pass, channels last."""
+        batch, channels, height, width = states.shape
+        # Channels move while they are bytes, by OpenCV: torch takes longer than for all the rest of this.
+        bytes_BHWC = cv2.merge([states[:, channel].reshape(-1, width) for channel in range(channels)])
+        x_BHWC = self._sent(bytes_BHWC.reshape(batch, height, width, channels))
+        return x_BHWC.to(self.dtype).div_(255).permute(0, 3, 1, 2)
+
+    def _sent(self, array: npt.NDArray[Any]) -> torch.Tensor:
+        tensor = torch.from_numpy(array)
+        # From memory that may be paged out, a copy to a GPU waits for all that was asked of the GPU before.
+        return tensor.pin_memory().to(self.device, non_blocking=True) if self.device.type == "cuda" else tensor

@@ -1,0 +1,60 @@
+"""Help: every key with its value and its sentence, without loading what a verb works with."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+from hydra import compose
+from omegaconf import OmegaConf
+
+from atlantis_exp.checking import flatten
+from atlantis_exp.commands import CONF, VERBS
+from atlantis_exp.commands.composing import composing
+from atlantis_exp.commands.helping import help_text
+
+
+def shown_keys(verb: str, *arguments: str) -> dict[str, str]:
+    """The keys of a help and their values; of a preset's the last."""
+    return dict(
+        re.findall(r"^  ([a-z_.]+)=(.*?)(?:  .*)?$", help_text(verb, arguments).partition("== Flags")[0], re.MULTILINE)
+    )
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_key_of_a_verb_is_shown_and_no_other(verb: str) -> None:
+    with composing():
+        tree = OmegaConf.to_container(compose("config" if verb == "train" else verb), resolve=False)
+    assert isinstance(tree, dict)
+    keys = flatten({str(key): value for key, value in tree.items()})
+    lists = {re.sub(r"\.\d+$", "", key) for key in keys}  # a list is one key
+    named = {key for key in lists if key.endswith(".name")}
+    library = {key for key in lists if key.startswith("samplers.")}
+    assert {*shown_keys(verb)} - {"plugins"} == lists - named - library - {"plugins"}
+
+
+def test_a_preset_and_a_chosen_option_show_their_keys() -> None:
+    fast = shown_keys("train", "experiment=fast", "--help")
+    assert (fast["objective.n_step"], fast["objective.quantiles"]) == ("10", "51")
+    assert "epsilon.duration" in shown_keys("train", "epsilon=linear")
+    assert "epsilon.duration" not in shown_keys("train")
+    assert "model=nothing   (cnn, resnet, resnet_fast)" in help_text("train", ["model=nothing"])
+
+
+def test_every_sentence_next_to_a_key_is_there() -> None:
+    text = help_text("compare", [])
+    sentences = re.findall(r"# (.+)", (CONF / "compare.yaml").read_text().partition("hydra_defaults")[2])
+    assert len(sentences) > 8
+    assert all(sentence in text for sentence in sentences)
+
+
+def test_help_and_a_misspelt_verb_load_nothing_heavy() -> None:
+    program = (
+        "import atexit, sys; "
+        "atexit.register(lambda: print(sorted({'torch', 'mlflow', 'hydra', 'omegaconf', 'numpy', 'ale_py'} "
+        "& {*sys.modules}), file=sys.stderr)); "
+        "from atlantis_exp.commands import main; main()"
+    )
+    for words in (["--help"], ["compare", "--help"], ["trian"]):
+        done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True, check=False)
+        assert done.stderr.splitlines()[-1] == "[]", words
