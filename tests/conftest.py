@@ -1,5 +1,6 @@
 import logging
 import os
+import re
 import shutil
 import signal
 import socket
@@ -204,7 +205,10 @@ def tiny(tmp_path: Path) -> Callable[..., Config]:
     """Composes a config of a training of seconds: `tiny("model=resnet", "seed=1")`."""
 
     def composed(*overrides: str) -> Config:
-        config = _composed(*overrides).copy()
+        seeds = [override for override in overrides if re.fullmatch(r"seed=\d+", override)]
+        config = _composed(*(override for override in overrides if override not in seeds)).copy()
+        if seeds:
+            config.seed = int(seeds[-1].removeprefix("seed="))
         if not any(override.startswith("paths.outputs=") for override in overrides):
             config.paths.outputs = str(tmp_path)
         return checked(Config, config)

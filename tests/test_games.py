@@ -111,7 +111,7 @@ def test_the_emulator_plays_other_games_as_gymnasium_does(name: str) -> None:
 
 
 @pytest.mark.usefixtures("both")
-@pytest.mark.parametrize(("name", "sources"), [("breakout", 0), ("pong", 2)])
+@pytest.mark.parametrize(("name", "sources"), [pytest.param("breakout", 0, marks=pytest.mark.slow), ("pong", 2)])
 def test_a_game_of_a_plugin_is_played_in_worker_processes(tiny: Compose, name: str, sources: int) -> None:
     env = tiny(BOTH, f"env={name}", "env.num_envs=2", "env.max_steps=null").env
     steps = []

@@ -4,7 +4,7 @@ import argparse
 import itertools
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -209,11 +209,27 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
                 _offered(folder, str(value))
                 or f"{folder}={value}: no such option in conf/{folder}; {nearest(str(value), options)}{hint}"
             )
-    keys = _keys(config_name, chosen)
+    values = {text: override for text, override in overrides.items() if text not in chosen}
+    try:
+        if any(each.is_add() or each.is_force_add() or each.is_delete() for each in values.values()):
+            _check_keys(values, _keys(config_name, chosen), groups)
+        try:
+            composed = _composed(config_name, tuple(texts))
+        except HydraException:  # mostly a key that is not there; to know them all takes as long as to compose
+            _check_keys(values, _keys(config_name, chosen), groups)
+            raise
+        if OmegaConf.select(composed, "plugins") and "plugins" not in {_key(each) for each in overrides.values()}:
+            raise ConfigError(f"--config-dir={own}: names plugins; only the command line may, as plugins=./FILE.py")
+        return checked(schema, composed)
+    except InterpolationKeyError as error:
+        missing = "".join(re.findall("'(.*)'", str(error)))
+        raise ConfigError(f"${{{missing}}}: no such key; {_nearest_key(missing, _keys(config_name, chosen))}") from None
+
+
+def _check_keys(values: Mapping[str, Override], keys: frozenset[str], groups: set[str]) -> None:
+    """Refuse overrides of keys that are not there, that are added though they are, and that are needed."""
     branches = {key.rsplit(".", depth)[0] for key in keys for depth in range(1, key.count(".") + 1)}
-    for text, override in overrides.items():
-        if text in chosen:
-            continue
+    for text, override in values.items():
         key = _key(override)
         if key not in keys | branches:
             raise ConfigError(f"{text}: no such key; {_nearest_key(key, keys | branches | groups)}")
@@ -221,14 +237,6 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
             raise ConfigError(f"{text}: the key is there already; write {text.removeprefix('+')}")
         if override.is_delete() and not key.startswith("phase."):
             raise ConfigError(f"{text}: needed; change it with {key}=VALUE")
-    try:
-        composed = _composed(config_name, tuple(texts))
-        if OmegaConf.select(composed, "plugins") and "plugins" not in {_key(each) for each in overrides.values()}:
-            raise ConfigError(f"--config-dir={own}: names plugins; only the command line may, as plugins=./FILE.py")
-        return checked(schema, composed)
-    except InterpolationKeyError as error:
-        missing = "".join(re.findall("'(.*)'", str(error)))
-        raise ConfigError(f"${{{missing}}}: no such key; {_nearest_key(missing, keys)}") from None
 
 
 def located(arguments: Sequence[str]) -> list[str]:

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from atlantis_exp.comparison.gather import gather, plays_alike
+from atlantis_exp.comparison.gather import gather, group, plays_alike
+from atlantis_exp.comparison.tables import compare
+from atlantis_exp.comparison.verdict import Question
 from atlantis_exp.config import Config
 from atlantis_exp.sessions import cards
 from atlantis_exp.sessions.cards import read_card
@@ -72,9 +74,8 @@ def test_exported_weights_score_what_their_card_says(
     alike = {player.config["evaluation.epsilon"]: plays_alike(player, training) for player in gathered.players}
     assert alike == {0.9: False, 0.05: True}
     assert {player.called for player in gathered.players} == {"weights tiny"}
-    capsys.readouterr()
-    assert command("compare", f"paths.outputs={trained}", "tracking=none") == 0
-    assert re.search(r"In the same game, on average: weights tiny [\d,]+\.", capsys.readouterr().out)
+    comparison = compare(gathered, group(gathered.trainings, ["model"]), Question(["model"]))
+    assert re.search(r"In the same game, on average: weights tiny [\d,]+\.", " ".join(comparison.notes))
 
 
 def test_an_export_neither_overwrites_nor_starts_without_weights(
