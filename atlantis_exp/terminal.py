@@ -1,8 +1,15 @@
-"""Texts on a terminal as they are, where a name with brackets is no markup, and durations."""
+"""Texts on a terminal as they are, where a name with brackets is no markup; what is under way, and durations."""
 
 import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from rich.console import Console
+
+LINE_SECONDS = 4.0  # between two lines of what is under way: nothing is silent for five
+_FIRST_SECONDS = 1.0  # what takes less needs no line
 
 
 def console(least: int | None = None) -> Console:
@@ -11,6 +18,38 @@ def console(least: int | None = None) -> Console:
         return Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
     width = max(shutil.get_terminal_size().columns, least)
     return Console(highlight=False, markup=False, emoji=False, width=width)
+
+
+@contextmanager
+def working(what: str, how_far: Callable[[], str] = str) -> Iterator[None]:
+    """Say what is under way, and how far: in a changing line on a terminal, elsewhere in a line every few seconds.
+
+    how_far is asked for each line, in another thread.
+    """
+    shown, began, ended = console(), time.monotonic(), threading.Event()
+
+    def line() -> str:
+        return ", ".join(filter(None, (what, how_far(), f"{time.monotonic() - began:.0f} s")))
+
+    def tell() -> None:
+        if ended.wait(_FIRST_SECONDS):
+            return
+        if not shown.is_terminal:
+            shown.print(line())
+            while not ended.wait(LINE_SECONDS):
+                shown.print(line())
+            return
+        with shown.status(line()) as status:
+            while not ended.wait(0.25):
+                status.update(line())
+
+    thread = threading.Thread(target=tell, name="telling", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def clock(seconds: float) -> str:

@@ -12,6 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from atlantis_exp import terminal
 from atlantis_exp.commands import CONF
 from atlantis_exp.commands.composing import admit, checked
 from atlantis_exp.commands.overrides import check, is_run, launcher, located, refuse_twice
@@ -71,7 +72,9 @@ class Verb(Generic[T]):
             flags = tuple(text for text in arguments if text.startswith("--config-dir="))
             if is_run(arguments):  # which Hydra itself would compose twice more
                 ((overrides, config),) = jobs.items()
-                self.work(Asked(config, self.name, (*flags, *overrides), job_apart(), typed))()
+                with terminal.working(f"{self.name}: loading"):
+                    call = self.work(Asked(config, self.name, (*flags, *overrides), job_apart(), typed))
+                call()
                 return
         except (Fault, OSError) as error:
             exit_with(error)

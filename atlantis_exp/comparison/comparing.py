@@ -77,7 +77,8 @@ def compare(
         Fault: where commits are compared with a baseline and another one is worse.
     """
     outputs = Path(paths.outputs)
-    gathered = gather(outputs, runs, at_epsilon, put_aside=COMMIT in question.by)
+    with terminal.working(f"reading the runs under {outputs}"):
+        gathered = gather(outputs, runs, at_epsilon, put_aside=COMMIT in question.by)
     for name, reason in gathered.skipped.items():
         print(f"atlantis_exp: left out {name}: {reason}", file=sys.stderr)
     trainings = select(gathered.trainings, where)
@@ -104,7 +105,8 @@ def compare(
     tags = {"mlflow.runName": name, "mlflow.runColor": colour, "atlantis.kind": "comparison"}
     with folder.held():
         record = read_looks(folder.path, asked)
-        comparison = tables.compare(gathered, groups, question, record, look_now)
+        with terminal.working("computing the tables"):
+            comparison = tables.compare(gathered, groups, question, record, look_now)
         write_looks(folder.path, comparison.answers)
         comparison = replace(
             comparison,
@@ -119,7 +121,8 @@ def compare(
             "runs": f"{len(trainings)} under {outputs / 'runs'}",
             **probed.facts,
         }
-        figures = draw(comparison)
+        with terminal.working("drawing the figures"):
+            figures = draw(comparison)
         with publishing(folder, tracking, outputs, tags) as journal:
             folder.write_config(facts)
             journal.params({key: str(value) for key, value in flatten(facts).items()})

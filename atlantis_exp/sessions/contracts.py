@@ -56,7 +56,8 @@ def check(job: Job, small: Job, beside: Sequence[Job]) -> None:
     table, broken = Table("component", "contract", "", "because"), []
     for part, contract, trial in trials(config, small):
         try:
-            trial()
+            with terminal.working(f"{part}: {contract}"):
+                trial()
             table.add_row(part, contract, "kept", "")
         except Exception as error:
             broken.append(f"{part}: {contract}")
@@ -64,7 +65,9 @@ def check(job: Job, small: Job, beside: Sequence[Job]) -> None:
             kind = "" if isinstance(error, Fault) else f"{type(error).__name__}: "
             table.add_row(part, contract, "BROKEN", kind + reason)
     terminal.console(least=120).print(table)
-    terminal.console(least=120).print(_costs([job, *beside]))
+    with terminal.working("measuring what the networks cost"):
+        costs = _costs([job, *beside])
+    terminal.console(least=120).print(costs)
     if broken:
         raise Fault(f"broken: {', '.join(broken)}")
 

@@ -5,6 +5,7 @@ import socket
 import sys
 from pathlib import Path
 
+from atlantis_exp import terminal
 from atlantis_exp.config import PathsConfig
 from atlantis_exp.faults import Fault
 from atlantis_exp.tracking.store import Store
@@ -20,7 +21,8 @@ def serve(*, port: int, paths: PathsConfig) -> None:
         except OSError as error:
             raise Fault(f"port={port}: {error.strerror}; choose another, as in port=5001") from None
     store = Store(Path(paths.outputs))
-    store.prepare()
+    with terminal.working("preparing MLflow's store"):
+        store.prepare()
     print(f"MLflow UI: {address(f'http://127.0.0.1:{port}', store.experiment_id, START)}", flush=True)
     os.environ["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] = "false"  # ten processes otherwise
     arguments = ["server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]

@@ -9,6 +9,7 @@ from functools import partial
 
 import torch
 
+from atlantis_exp import terminal
 from atlantis_exp.build import build_trainer, choose_device, described, import_components
 from atlantis_exp.checking import flatten, to_dict
 from atlantis_exp.config import Config
@@ -47,7 +48,8 @@ def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int |
     about = f"Network `{config.model.name}` on {config.env.id}, seed {config.seed}. Continue or report: `{job.command}`"
     with folder.held(), stop.installed(), publishing(folder, tracking, job.outputs, shown) as journal:
         with _faults_recorded(job, folder, journal), closing(progress):
-            trainer = build_trainer(config, folder.path, journal, progress, about)
+            with terminal.working("building the network and the emulators"):
+                trainer = build_trainer(config, folder.path, journal, progress, about)
             with trainer.emulators:
                 _open(trainer, job, folder, journal, progress)
                 watched = partial(watch, trainer)
@@ -94,7 +96,8 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
 def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progress: Progress) -> None:
     """Bring a trainer to its run's last commit, and write down what the run is."""
     config = job.config
-    state = trainer.checkpoints.load(trainer.memory, progress.say)
+    with terminal.working("reading the checkpoint and the replay memory"):
+        state = trainer.checkpoints.load(trainer.memory, progress.say)
     folder.write_config(to_dict(config))
     with unforged(folder.checkpoints):
         steps_done = 0 if state is None else int(state["counters"]["steps"])
@@ -112,7 +115,7 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
         journal.artifact(CONFIG, (folder.path / CONFIG).read_bytes())
         journal.tags({"flops_per_update": str(flops)})
     else:
-        with unforged(folder.checkpoints):
+        with unforged(folder.checkpoints), terminal.working("playing the games up to where they were"):
             trainer.load_state_dict(state)
     if lost := trainer.checkpoints.lost:
         journal.tags({LOST: f"{lost:,} observations of the replay memory, at step {steps_done:,}"})
@@ -154,7 +157,8 @@ def expected(trainer: Trainer, config: Config, steps_done: int) -> Forecast:
 
 
 def _check_forecast(trainer: Trainer, config: Config, steps_done: int, progress: Progress) -> None:
-    cost = expected(trainer, config, steps_done)
+    with terminal.working("measuring how fast it goes here"):
+        cost = expected(trainer, config, steps_done)
     progress.say(str(cost))
     if cost.shortage is not None:
         if config.budget.forecast == "refuse":

@@ -10,9 +10,11 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
+from atlantis_exp import terminal
 from atlantis_exp.build import build_memory
 from atlantis_exp.checking import flatten, to_dict
 from atlantis_exp.config import Config
@@ -25,7 +27,7 @@ from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.fingerprint import fingerprint
 
 _KILLS = 3
-_SAID = "stderr.txt"  # of the latest session
+_SAID, _SAYS = "stderr.txt", "stdout.txt"  # of the latest session
 
 
 def verify_resume(job: Job) -> None:
@@ -37,10 +39,13 @@ def verify_resume(job: Job) -> None:
         for name in ("unbroken", "killed"):
             shutil.rmtree(folder.path / name, ignore_errors=True)
         print(f"training {config.run_name()} unbroken", flush=True)
-        train_and_kill(config, overrides, folder.path / "unbroken", 0)
+        with terminal.working("  unbroken", partial(_last_line, folder.path / "unbroken" / _SAYS)):
+            train_and_kill(config, overrides, folder.path / "unbroken", 0)
         print(f"training it again, killed {_KILLS} times", flush=True)
-        kills = train_and_kill(config, overrides, folder.path / "killed", _KILLS)
-        unbroken, killed = fingerprints(config, folder.path / "unbroken"), fingerprints(config, folder.path / "killed")
+        with terminal.working("  killed and continued", partial(_last_line, folder.path / "killed" / _SAYS)):
+            kills = train_and_kill(config, overrides, folder.path / "killed", _KILLS)
+        with terminal.working("comparing the two"):
+            unbroken, killed = (fingerprints(config, folder.path / name) for name in ("unbroken", "killed"))
         differing = sorted(part for part in unbroken if unbroken[part] != killed[part])
         verdict = f"differs in {', '.join(differing)}" if differing else "is the unbroken one, bit for bit"
         shown = labels(f"verify-resume {job.title}", job.colour, "verification")
@@ -85,9 +90,9 @@ class Session(Protocol):
 
 
 def start(command: Sequence[str], said: Path) -> Session:
-    """Start a command in a process group of its own; what it says on stderr goes to a file."""
-    with open(said, "wb") as file:
-        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=file, start_new_session=True)
+    """Start a command in a process group of its own; what it says on stderr goes to a file, the rest beside it."""
+    with open(said, "wb") as errors, open(said.with_name(_SAYS), "wb") as lines:
+        return subprocess.Popen(command, stdout=lines, stderr=errors, start_new_session=True)
 
 
 def run_and_kill(start: Callable[[Path], Session], outputs: Path, runs: str, kills: int, seconds: float = 1.0) -> int:
@@ -130,6 +135,12 @@ def fingerprints(config: Config, outputs: Path) -> dict[str, str]:
     if state is None:
         raise Fault(f"there is no checkpoint in {folder.path}")
     return fingerprint(state, memory, folder.path)
+
+
+def _last_line(path: Path) -> str:
+    """How far a session says that it is; empty before it says anything."""
+    lines = path.read_text(errors="replace").split("\n") if path.exists() else []
+    return next((line.strip() for line in reversed(lines) if line.strip()), "")
 
 
 def _commits(outputs: Path, runs: str) -> int:

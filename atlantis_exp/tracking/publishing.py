@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from atlantis_exp import terminal
 from atlantis_exp.config import TrackingConfig
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder, all_folders
@@ -39,7 +40,9 @@ def publishing(
     try:
         yield journal
     finally:
-        if not publisher.drain(_DRAIN_SECONDS):
+        with terminal.working("publishing to MLflow"):
+            is_sent = publisher.drain(_DRAIN_SECONDS)
+        if not is_sent:
             print(
                 f"atlantis_exp: MLflow has not taken all of {folder.name} yet; the run's folder has it", file=sys.stderr
             )
@@ -65,5 +68,6 @@ def catch_up(outputs: Path, continued: Path | None = None) -> None:
             continue
         if store is None or store.address in unreachable:
             continue
-        if not Publisher(folder.path, store).drain(_DRAIN_SECONDS):
-            unreachable.add(store.address)
+        with terminal.working(f"publishing {folder.name}, which an earlier command could not"):
+            if not Publisher(folder.path, store).drain(_DRAIN_SECONDS):
+                unreachable.add(store.address)

@@ -135,5 +135,7 @@ def _size(count: float) -> str:
 
 
 def duration(hours: float) -> str:
-    """Hours as a person reads them, in minutes where they are less than one."""
-    return f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:,.0f} minutes"
+    """Hours as a person reads them, in minutes where they are less than one, in seconds where those are."""
+    if hours >= 1:
+        return f"{hours:,.1f} hours"
+    return f"{hours * 60:,.0f} minutes" if hours * 60 >= 2 else f"{hours * 3600:,.0f} seconds"

@@ -19,7 +19,6 @@ from atlantis_exp import terminal
 if TYPE_CHECKING:
     from atlantis_exp.training.evaluation import Episode, Evaluation
 
-_PLAIN_SECONDS = 10.0  # between two plain lines
 _DRAW_SECONDS = 0.25  # between two states of the bar
 _WINDOW_SECONDS = 30.0  # that the pace is measured over
 _MARK_SECONDS = 0.25  # between two marks in that window
@@ -143,7 +142,7 @@ class Progress:
     def _is_time_for_a_line(self) -> bool:
         if self._shown is None:  # the first one comes when there is something to tell
             self._shown = time.monotonic()
-        return time.monotonic() - self._shown >= _PLAIN_SECONDS
+        return time.monotonic() - self._shown >= terminal.LINE_SECONDS
 
     def close(self) -> None:
         """End the bar."""

@@ -34,9 +34,10 @@ def test_an_evaluation_says_how_far_it_is_now_and_then(clock: Clock, monkeypatch
     for over in range(7):
         episodes[1].actions.append(0)
         progress.evaluating(episodes, over // 3)
-        clock.now += 4
+        clock.now += 2
     assert text.getvalue().splitlines() == [
-        "  evaluation: 1 of 3 episodes over, 4 steps, highest score 1,200",
+        "  evaluation: 0 of 3 episodes over, 3 steps, highest score 1,200",
+        "  evaluation: 1 of 3 episodes over, 5 steps, highest score 1,200",
         "  evaluation: 2 of 3 episodes over, 7 steps, highest score 1,200",
     ]
 
@@ -108,7 +109,7 @@ def test_the_time_left_follows_from_the_pace(steps_left: float | None, steps_per
     assert line.endswith(f"  left {left}\n")
 
 
-@pytest.mark.parametrize(("terminal", "seconds", "at_once"), [(False, 10.0, False), (True, 0.25, True)])
+@pytest.mark.parametrize(("terminal", "seconds", "at_once"), [(False, 4.0, False), (True, 0.25, True)])
 def test_a_training_is_shown_a_few_times_a_second_on_a_terminal_and_now_and_then_elsewhere(
     clock: Clock, monkeypatch: pytest.MonkeyPatch, terminal: bool, seconds: float, at_once: bool
 ) -> None:

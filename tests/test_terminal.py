@@ -1,0 +1,59 @@
+"""What a person sees of work that takes long."""
+
+import io
+import threading
+
+import pytest
+from rich.console import Console
+
+from atlantis_exp import terminal
+
+
+@pytest.fixture
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(terminal, "_FIRST_SECONDS", 0.01)
+    monkeypatch.setattr(terminal, "LINE_SECONDS", 0.01)
+
+
+@pytest.mark.usefixtures("_quick")
+def test_long_work_says_what_it_is_and_how_far_again_and_again(capsys: pytest.CaptureFixture[str]) -> None:
+    asked, enough = 0, threading.Event()
+
+    def how_far() -> str:
+        nonlocal asked
+        asked += 1
+        if asked == 3:
+            enough.set()
+        return f"{asked} of 10"
+
+    with terminal.working("drawing [b]", how_far):
+        assert enough.wait(30)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[:2] == ["drawing [b], 1 of 10, 0 s", "drawing [b], 2 of 10, 0 s"]
+
+
+def test_short_work_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    with terminal.working("nothing"):
+        pass
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.usefixtures("_quick")
+def test_on_a_terminal_it_is_one_line_that_goes_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen, asked = io.StringIO(), threading.Event()
+    monkeypatch.setattr(terminal, "console", lambda: Console(file=screen, force_terminal=True, width=80))
+
+    def how_far() -> str:
+        if "drawing" in screen.getvalue():
+            asked.set()
+        return ""
+
+    with terminal.working("drawing", how_far):
+        assert asked.wait(30)
+    assert screen.getvalue().endswith("\x1b[2K")  # the line, cleared
+
+
+def test_an_error_ends_the_telling() -> None:
+    with pytest.raises(ZeroDivisionError), terminal.working("failing"):
+        _ = 1 / 0
+    assert not [thread for thread in threading.enumerate() if thread.name == "telling"]
