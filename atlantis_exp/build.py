@@ -321,7 +321,7 @@ def build_evaluator(env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig) -> Eva
         make_emulator=make_emulator(env),
         epsilon=evaluation.epsilon,
         seed=evaluation.seed,
-        num_envs=evaluation.num_envs,
+        num_envs=evaluation.at_once,
         size=env.size,
         stack=env.stack,
         video="first_minute" if evaluation.video is True else evaluation.video or None,

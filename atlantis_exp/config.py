@@ -6,6 +6,7 @@ stored run passes through the same door as one typed on a command line.
 
 import dataclasses
 import json
+import math
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import MISSING, field
@@ -26,6 +27,7 @@ STRICT = ConfigDict(defer_build=True, strict=True, extra="forbid", allow_inf_nan
 
 Count = Annotated[int, Field(ge=1, le=10**12)]
 Frameskip = Annotated[int, Field(ge=1, le=256)]
+_MOST_GAMES = 64  # that an evaluation plays side by side
 Episodes = Annotated[int, Field(ge=1, le=10**6)]  # of one evaluation
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Size = Annotated[int, Field(ge=8, le=210)]
@@ -314,9 +316,14 @@ class EvaluationConfig:
     every_episodes: Count | None  # training episodes between evaluations; null: none of them
     every_steps: Count | None  # training steps between evaluations; null: none of them
     at_end: bool
-    num_envs: Annotated[int, Field(ge=1, le=64)]
+    num_envs: Annotated[int, Field(ge=1, le=_MOST_GAMES)] | None  # episodes side by side; null: `at_once` chooses
     seed: Seed
     video: Literal["first_minute", "best_minute", "all"] | bool  # of the best episode; true is its first minute
+
+    @property
+    def at_once(self) -> int:
+        """Episodes played side by side: more are faster, and rounds of one length leave no emulator idle."""
+        return self.num_envs or math.ceil(self.episodes / math.ceil(self.episodes / _MOST_GAMES))
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)

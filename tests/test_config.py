@@ -3,6 +3,7 @@
 import copy
 import random
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -244,3 +245,15 @@ def test_a_stored_config_that_is_wrong_is_one_line(change: Callable[[Tree], Any]
     with pytest.raises(ConfigError, match=line) as caught:
         parse(Config, tree)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("episodes", "num_envs", "at_once"),
+    [(1, None, 1), (5, None, 5), (64, None, 64), (65, None, 33), (100, None, 50), (1_000, None, 63), (100, 16, 16)],
+)
+def test_an_evaluation_plays_many_games_at_once_in_rounds_of_one_length(
+    tiny: Callable[..., Config], episodes: int, num_envs: int | None, at_once: int
+) -> None:
+    evaluation = replace(tiny().evaluation, episodes=episodes, num_envs=num_envs)
+    assert evaluation.at_once == at_once
+    assert -(-episodes // at_once) == -(-episodes // (num_envs or 64))

@@ -73,6 +73,7 @@ def evaluate(
         }
         evaluation = replace(evaluation, **protocol)
         actor = build_exported_actor(trained, stored, device)
+    evaluation = replace(evaluation, num_envs=evaluation.at_once)
     facts = {**source, "step": step, "evaluation": to_dict(evaluation), "env": to_dict(trained.env)}
     recorded = RunFolder(outputs / "evaluations" / f"{name}-at-{step}-{digest(facts)[:6]}")
     shown = labels(f"evaluation of {title} at {step} {digest(facts)[:6]}", config_colour(trained), "evaluation")

@@ -39,7 +39,7 @@ def export(
     folder.mkdir(parents=True, exist_ok=True)  # before the episodes, lest there be no place for their scores
     if any(folder.iterdir()):
         raise ConfigError(f"to={folder}: is not empty; name another folder")
-    settings = replace(evaluation, video=False)
+    settings = replace(evaluation, video=False, num_envs=evaluation.at_once)
     progress = Progress()
     progress.say(f"{source.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
     played = build_evaluator(trained.env, settings)(actor, settings.episodes, progress)
