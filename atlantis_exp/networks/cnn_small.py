@@ -1,0 +1,45 @@
+"""The network of the first DQN paper."""
+
+import torch
+from torch import nn
+
+from atlantis_exp.components import component
+from atlantis_exp.networks.heads import Head
+from atlantis_exp.networks.sizes import convolved
+
+
+@component("cnn_small", "model")
+class SmallCnn(nn.Module):
+    """Two convolutions and one hidden layer (Mnih et al. 2013, section 4.1): three tenths of DQNCnn's FLOPs at 84x84.
+
+    Input (B, C, H, W) in [0, 1], output that of the `head`, (B, num_actions) by default. The first dense layer follows
+    from `input_shape` = (C, H, W). Raises ValueError if a side is below `smallest_side`.
+    """
+
+    smallest_side = 20  # pixels: 20 -> 4 -> 1
+    splits_batches = True
+
+    def __init__(self, input_shape: tuple[int, int, int], num_actions: int, head: Head = nn.Linear) -> None:
+        super().__init__()
+        channels, height, width = input_shape
+        if min(height, width) < self.smallest_side:
+            raise ValueError(f"SmallCnn needs {self.smallest_side} pixels a side at least, not {height}x{width}")
+        self.features = nn.Sequential(  # 84x84
+            nn.Conv2d(channels, 16, kernel_size=8, stride=4),  # 20x20
+            nn.ReLU(),
+            nn.Conv2d(16, 32, kernel_size=4, stride=2),  # 9x9
+            nn.ReLU(),
+        )
+        self.fc = nn.Sequential(
+            nn.Linear(32 * _last_side(height) * _last_side(width), 256),
+            nn.ReLU(),
+            head(256, num_actions),
+        )
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        q: torch.Tensor = self.fc(self.features(x).flatten(1))
+        return q
+
+
+def _last_side(side: int) -> int:
+    return convolved(convolved(side, kernel=8, stride=4), kernel=4, stride=2)
