@@ -111,7 +111,7 @@ def another(key: str, value: Any) -> Any:
         "env.crop": ([0, 160, 210, 0], [16, 160, 96, 0]),
         "env.frameskip": (4, 3),
         "optimizer.betas": ([0.9, 0.999], [0.8, 0.9]),
-        "model.name": ("cnn", "resnet", "resnet_fast"),
+        "model.name": ("cnn", "cnn_small", "resnet", "resnet_fast"),
         "resume": ("auto", "never"),
         "device": ("auto", "cpu"),
         "tracking.name": ("mlflow", "none"),
@@ -235,7 +235,7 @@ def test_writing_a_config_down_and_reading_it_again_changes_nothing() -> None:
         (lambda tree: tree["phase"]["single"].update(lr=float("nan")), r"phase\.single\.lr=NaN: should be a finite"),
         (lambda tree: tree.update(env=3), r"env=3: "),
         (lambda tree: tree.update(phase={}), r"phase: at least one"),
-        (lambda tree: tree.update(model={"name": "vit"}), r"model\.name=vit: no such choice.*cnn, resnet"),
+        (lambda tree: tree.update(model={"name": "vit"}), r"model\.name=vit: no such choice.*cnn, cnn_small"),
         (lambda tree: tree["env"].update(crop=[0, 160, 210]), r"env\.crop\.3: missing"),
     ],
 )

@@ -40,7 +40,7 @@ FIELD = (0, 160, 210, 0)  # the whole screen
 OBSERVED = {"crop": (16, 160, 96, 0), "sticky": 0.25, "max_frames": 108_000, "noop_max": 0}
 RECORDED = {"curve_steps": 1_000, "histogram_episodes": 500, "commit_episodes": 100, "commit_seconds": 120.0}
 BUILT: dict[str, dict[str, Any]] = {  # group, option: what it builds
-    "model": {"cnn": "DQNCnn", "resnet": "ResNetDQN", "resnet_fast": "ResNetFast"},
+    "model": {"cnn": "DQNCnn", "cnn_small": "SmallCnn", "resnet": "ResNetDQN", "resnet_fast": "ResNetFast"},
     "objective": {
         "dqn": {"class": "DQN", "outputs": 4, "returns": RETURNS, **TARGET},
         "double_dqn": {"class": "DoubleDQN", "outputs": 4, "returns": RETURNS, **TARGET},

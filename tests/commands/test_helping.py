@@ -38,7 +38,7 @@ def test_a_preset_and_a_chosen_option_show_their_keys() -> None:
     assert (fast["objective.n_step"], fast["objective.quantiles"]) == ("10", "51")
     assert "epsilon.duration" in shown_keys("train", "epsilon=linear")
     assert "epsilon.duration" not in shown_keys("train")
-    assert "model=nothing   (cnn, resnet, resnet_fast)" in help_text("train", ["model=nothing"])
+    assert "model=nothing   (cnn, cnn_small, resnet, resnet_fast)" in help_text("train", ["model=nothing"])
 
 
 def test_every_sentence_next_to_a_key_is_there() -> None:
