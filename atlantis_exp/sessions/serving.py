@@ -9,7 +9,7 @@ from atlantis_exp import terminal
 from atlantis_exp.config import PathsConfig
 from atlantis_exp.faults import Fault
 from atlantis_exp.tracking.store import Store
-from atlantis_exp.tracking.views import START, address
+from atlantis_exp.tracking.views import COMPARISONS, START, address
 
 
 def serve(*, port: int, paths: PathsConfig) -> None:
@@ -23,7 +23,8 @@ def serve(*, port: int, paths: PathsConfig) -> None:
     store = Store(Path(paths.outputs))
     with terminal.working("preparing MLflow's store"):
         store.prepare()
-    print(f"MLflow UI: {address(f'http://127.0.0.1:{port}', store.experiment_id, START)}", flush=True)
+    for what, view in (("comparisons", COMPARISONS), ("MLflow UI", START)):
+        print(f"{what}: {address(f'http://127.0.0.1:{port}', store.experiment_id, view)}", flush=True)
     os.environ["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] = "false"  # ten processes otherwise
     arguments = ["server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
     os.execv(sys.executable, [sys.executable, "-m", "mlflow", *arguments, "--backend-store-uri", store.uri])

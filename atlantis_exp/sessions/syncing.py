@@ -12,7 +12,7 @@ from typing import NamedTuple
 from atlantis_exp.config import PathsConfig, TrackingConfig
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import COMMIT, RunFolder, all_folders
-from atlantis_exp.tracking.store import Store, brought, patience, publish
+from atlantis_exp.tracking.store import Store, StoredRun, brought, forget_lost, patience, publish
 from atlantis_exp.tracking.travel import bring, is_here, place
 
 _CHANGES = ("brought", "published")
@@ -80,21 +80,20 @@ def _tell(way: str, looks: Iterable[Look], is_first: bool) -> None:
 
 
 def _publish_all(outputs: Path, store: Store, only_brought: bool) -> Iterator[Look]:
+    listed = {run.run_id for run in _runs(store)}
     for folder in (each.path for each in reversed(all_folders(outputs))):  # sweeps before runs, which publish theirs
         run = str(folder.relative_to(outputs))
         try:
             if only_brought and brought(folder) is None:
                 continue
+            forget_lost(folder, store, listed)
             yield Look("published" if publish(folder, store, is_primary=False) else "up to date", run)
         except Exception as error:
             yield Look("failed", run, _reason(error, store))
 
 
 def _bring_all(outputs: Path, source: Store) -> Iterator[Look]:
-    try:
-        runs = sorted(source.runs(), key=lambda run: run.folder.parts[-2:], reverse=True)
-    except Exception as error:
-        raise Fault(f"{source.uri} cannot be reached: {_first_line(error)}") from None
+    runs = sorted(_runs(source), key=lambda run: run.folder.parts[-2:], reverse=True)
     listed = {run.run_id for run in runs}
     for run in runs:
         try:
@@ -110,6 +109,13 @@ def _bring_all(outputs: Path, source: Store) -> Iterator[Look]:
             yield Look("held", run.name, str(fault))
         except Exception as error:
             yield Look("failed", run.name, _reason(error, source))
+
+
+def _runs(store: Store) -> list[StoredRun]:
+    try:
+        return store.runs()
+    except Exception as error:
+        raise Fault(f"{store.uri} cannot be reached: {_first_line(error)}") from None
 
 
 @contextmanager

@@ -48,7 +48,7 @@ def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int |
     about = f"Network `{config.model.name}` on {config.env.id}, seed {config.seed}. Continue or report: `{job.command}`"
     with folder.held(), stop.installed(), publishing(folder, tracking, job.outputs, shown) as journal:
         with _faults_recorded(job, folder, journal), closing(progress):
-            with terminal.working("building the network and the emulators"):
+            with terminal.working("making the network and the emulators"):
                 trainer = build_trainer(config, folder.path, journal, progress, about)
             with trainer.emulators:
                 _open(trainer, job, folder, journal, progress)

@@ -9,12 +9,13 @@ import json
 import logging
 import math
 import os
+import re
 import shutil
 import signal
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
@@ -155,7 +156,10 @@ class Store:
 
     def prepare(self) -> None:
         """Makes the experiment explain itself and seeds its shared views, see `views`."""
-        for key, value in experiment_tags().items():
+        newest = next((run for run in self.runs() if run.tags.get("atlantis.kind") == "comparison"), None)
+        place = f"#/experiments/{self.experiment_id}/runs"
+        linked = f"[{newest.name}]({place}/{newest.run_id})" if newest else None
+        for key, value in experiment_tags(linked).items():
             self.client.set_experiment_tag(self.experiment_id, key, value)
 
     @property
@@ -406,6 +410,14 @@ def publish(folder: Path, store: Store, is_primary: bool = True) -> bool:
         return True
 
 
+def forget_lost(folder: Path, store: Store, listed: Collection[str]) -> None:
+    """Lets a folder be published anew whose run is no longer among those that the store has listed."""
+    note = _note(folder, store, is_primary=False)
+    cursor = Cursor.read(note)
+    if cursor is not None and note.name != ORIGIN and cursor.store == store.address and cursor.run_id not in listed:
+        Cursor(cursor.store, cursor.identity).save(note)
+
+
 def _note(folder: Path, store: Store, is_primary: bool) -> Path:
     """The file that says how far a folder is published in a store."""
     if (origin := brought(folder)) is not None and origin.store == store.address:
@@ -497,7 +509,9 @@ class _Mirror:
         self._client = store.client
         self._experiment_id = store.experiment_id
         self._run_id = run_id
-        self._latest = {point.key: point.timestamp for point in self._client.get_run(run_id).data._metric_objs}
+        run = self._client.get_run(run_id)
+        self._name = run.info.run_name
+        self._latest = {point.key: point.timestamp for point in run.data._metric_objs}
 
     def unsent(self, record: Metrics) -> "list[Metric]":
         """Returns a record's points but for those that MLflow is sure to have.
@@ -608,11 +622,12 @@ class _Mirror:
     def _send_model(self, record: Model) -> None:
         from mlflow.entities import LoggedModelOutput
 
-        same = f"source_run_id = '{self._run_id}' AND name = '{record.name}' AND tags.step = '{record.step}'"
+        same = f"source_run_id = '{self._run_id}' AND tags.step = '{record.step}'"
         found = self._client.search_logged_models([self._experiment_id], same, max_results=1)
         tags = {"step": str(record.step)}
+        name = re.sub("[/:.%\"']", "-", f"{self._name} {record.step}")  # which MLflow takes in no model's name
         create = self._client.create_logged_model
-        model_id = (found[0] if found else create(self._experiment_id, record.name, self._run_id, tags)).model_id
+        model_id = (found[0] if found else create(self._experiment_id, name, self._run_id, tags)).model_id
         self._client.log_model_artifact(model_id, str(self._artifacts / record.path))
         self._client.finalize_logged_model(model_id, "READY")
         outputs = self._client.get_run(self._run_id).outputs
@@ -620,7 +635,7 @@ class _Mirror:
             self._client.log_outputs(self._run_id, [LoggedModelOutput(model_id, record.step)])
         self.send_points(self._points(record, model_id))
         if record.best:
-            same = f"source_run_id = '{self._run_id}' AND name = '{record.name}' AND tags.best = 'true'"
+            same = f"source_run_id = '{self._run_id}' AND tags.best = 'true'"
             for model in self._client.search_logged_models([self._experiment_id], same):
                 if model.model_id != model_id:
                     self._client.delete_logged_model_tag(model.model_id, "best")

@@ -180,11 +180,11 @@ def _bring_files(
 ) -> None:
     """Write the files that records name, by path."""
     has_models = any(isinstance(record, Model) for record in named.values())
-    models = {(model.name, model.tags.get("step")): model for model in store.models(run.run_id)} if has_models else {}
+    models = {model.tags.get("step"): model for model in store.models(run.run_id)} if has_models else {}
     listed: dict[str, set[str]] = {}  # folders, and what lies in them
     for path, record in named.items():
         if isinstance(record, Model):
-            model = models.get((record.name, str(record.step)))
+            model = models.get(str(record.step))
             content = store.files(model.artifact_location).read(os.path.basename(path), ARTIFACT) if model else None
         else:
             there = f"{image_name(run.run_id, record)}.png" if isinstance(record, Image) else path

@@ -12,9 +12,9 @@ from typing import Any
 from atlantis_exp.runs.journal import NOTE
 
 _SECTIONS = {  # cards a row, and their height in pixels
+    "evaluation": (2, 360),
     "score": (2, 360),
     "pictures": (1, 520),
-    "evaluation": (2, 360),
     "actions": (2, 360),
     "learning": (2, 360),
     "throughput": (2, 360),
@@ -24,14 +24,18 @@ _COLUMNS = (
     *("metrics.`evaluation/interquartile_mean`", "metrics.`evaluation/high`", "metrics.`actions/random_share`"),
 )
 
-START, SWEEP = "start", "sweep"
+START, SWEEP, COMPARISONS = "start", "sweep", "comparisons"
 """The keys of the shared views, as `viewStateShareKey` in an address takes them."""
+
+_NO_PLAYERS = ("training sweep", "search", "decision", "comparison", "verification")
+"""Kinds of runs that played no game of their own."""
 
 _ABOUT = """\
 **Does network B play better than network A, and how sure is that?**
 
-- Two views are prepared (share key in the address): **Start here** has a line a run, the best evaluation first, and
-  **Sweep** has a line a group of runs that differ only in their seed: their mean, with its range.
+- Three views are prepared (share key in the address): **Start here** has a line a player, the best evaluation first;
+  **Sweep** has a line a group of runs that differ only in their seed: their mean, with its range; **Comparisons** has
+  a line a comparison, the newest first, with its verdict.
 - A run's name says what differs from the defaults: network, samplers, seed, then the rest. Blues are DQNCnn, reds
   ResNetDQN, paler ones sample otherwise than uniformly; grey is the random player.
 - `score/` is the training's own play, with the exploration that `actions/epsilon` shows. `evaluation/` is what counts:
@@ -50,10 +54,16 @@ def how_to_open(outputs: Path) -> str:
     return f"the MLflow UI: make ui, or python -m atlantis_exp ui paths.outputs={shown}"
 
 
-def experiment_tags() -> dict[str, str]:
-    """The tags of an experiment that explain it and prepare its views."""
-    tags = {NOTE: _ABOUT, "mlflow.experimentKind": "custom_model_development"}
-    for key, name, state in ((START, "Start here", _start_here()), (SWEEP, "Sweep", _sweep())):
+def experiment_tags(newest: str | None) -> dict[str, str]:
+    """The tags of an experiment that explain it and prepare its views; newest: a link to its newest comparison."""
+    note = f"{_ABOUT}- The newest comparison: {newest}\n" if newest else _ABOUT
+    tags = {NOTE: note, "mlflow.experimentKind": "custom_model_development"}
+    views = {
+        START: ("Start here", _start_here()),
+        SWEEP: ("Sweep", _sweep()),
+        COMPARISONS: ("Comparisons", _verdicts()),
+    }
+    for key, (name, state) in views.items():
         packed = "deflate;" + base64.b64encode(zlib.compress(json.dumps(state).encode())).decode()
         view = {"name": name, "createdAt": 0, "updatedAt": 0, "state": packed}
         tags[f"mlflow.sharedViewState.{key}"] = json.dumps(view)
@@ -62,8 +72,9 @@ def experiment_tags() -> dict[str, str]:
 
 def address(server: str, experiment_id: str, view: str) -> str:
     """What opens a view of an experiment on a server."""
+    mode = "TABLE" if view == COMPARISONS else "CHART"
     return (
-        f"{server}/#/experiments/{experiment_id}/runs?workflowType=machine_learning&compareRunsMode=CHART"
+        f"{server}/#/experiments/{experiment_id}/runs?workflowType=machine_learning&compareRunsMode={mode}"
         f"&viewStateShareKey={view}"
     )
 
@@ -75,13 +86,14 @@ def _start_here() -> dict[str, Any]:
         "showAllRuns": True,
     }
     charts = [
+        _bar("evaluation", "evaluation/interquartile_mean"),
+        _bar("evaluation", "evaluation/mean"),
+        _line("evaluation", "evaluation/mean"),
+        _chart("PARALLEL", "evaluation", **parallel),  # not among groups, which have only numbers for params
         _line("score", "score/mean_100"),
         _line("score", "score/episode"),
         _images("pictures", "score/histogram", "score/heatmap"),
         _images("pictures", "evaluation/histogram"),
-        _line("evaluation", "evaluation/mean"),
-        _bar("evaluation", "evaluation/interquartile_mean"),
-        _chart("PARALLEL", "evaluation", **parallel),  # not among groups, which have only numbers for params
         _line("actions", "actions/epsilon"),
         _line("actions", "actions/network_share"),
         _line("learning", "learning/loss"),
@@ -93,15 +105,15 @@ def _start_here() -> dict[str, Any]:
         **_page(START, charts),
         # Sorted by anything but time MLflow shows a sweep's runs themselves, else their collapsed parent.
         "orderByKey": "metrics.`evaluation/interquartile_mean`",
-        "searchFilter": "tags.`atlantis.kind` != 'training sweep' AND tags.`atlantis.kind` != 'search'",
+        "searchFilter": " AND ".join(f"tags.`atlantis.kind` != '{kind}'" for kind in _NO_PLAYERS),
     }
 
 
 def _sweep() -> dict[str, Any]:
     charts = [
-        _line("score", "score/mean_100"),
-        _line("evaluation", "evaluation/mean"),
         _bar("evaluation", "evaluation/interquartile_mean"),
+        _line("evaluation", "evaluation/mean"),
+        _line("score", "score/mean_100"),
     ]
     return {
         **_page(SWEEP, charts),
@@ -109,6 +121,15 @@ def _sweep() -> dict[str, Any]:
         "useGroupedValuesInCharts": True,
         "orderByKey": "metrics.`evaluation/interquartile_mean`",
         "searchFilter": "tags.`atlantis.kind` = 'training'",
+    }
+
+
+def _verdicts() -> dict[str, Any]:
+    return {
+        **_page(COMPARISONS, []),
+        "selectedColumns": ["tags.`verdict`", "attributes.`Created`"],
+        "orderByKey": "attributes.start_time",
+        "searchFilter": "tags.`atlantis.kind` = 'comparison'",
     }
 
 

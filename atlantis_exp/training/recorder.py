@@ -48,7 +48,7 @@ class Recorder:
     """Tells a tracker and a person how a training goes; has a state of its own, and changes nobody else's.
 
     score_range: the axis of the pictures of scores.
-    about: markdown that opens the run's description: what it is and how to continue it.
+    about: markdown that ends the run's description: what it is and how to continue it.
     """
 
     def __init__(
@@ -235,20 +235,19 @@ class Recorder:
     def _describe(self, state: str, counters: Counters) -> None:
         """Say in a few lines of markdown what the run is, how far it is and what it has reached."""
         reached = self.last_metrics
-        lines = [
-            self.about,
+        lines = [  # the result first: MLflow shows five lines and folds the rest
             f"**{state}** at step {counters.steps:,}: {counters.episodes:,} episodes, {counters.frames:,} frames, "
             f"{self.learner.updates:,} updates, {counters.seconds / 3600:.2f} hours",
         ]
         if reached:
             scores = " | ".join(f"{reached[f'evaluation/{point}']:,.0f}" for point in TABLE_COLUMNS)
             lines += [
+                f"The best mean so far is {self.best_mean:,.0f}, at step {self.best_step:,}.",
                 "| evaluated at step | mean | +- | median | IQM | high | low | epsilon | episodes | random |\n"
                 f"|{' ---: |' * 10}\n| {self.evaluated_at:,} | {scores} | {reached['evaluation/epsilon']} | "
                 f"{reached['evaluation/episodes']:.0f} | {reached['actions/random_share']:.1%} |",
-                f"The best mean so far is {self.best_mean:,.0f}, at step {self.best_step:,}.",
             ]
-        self.tracker.note("\n\n".join(lines))
+        self.tracker.note("\n\n".join([*lines, self.about]))
 
     def _snapshot(self, counters: Counters) -> Snapshot:
         done, length = self.plan.done(counters), self.plan.length

@@ -80,7 +80,7 @@ def address(outputs: Path, free_port: Callable[[], int], answering: Callable[...
         start_new_session=True,  # it has a process that serves
     )
     assert server.stdout is not None
-    shown = server.stdout.readline().split()[-1]
+    shown = next(line for line in server.stdout if line.startswith("MLflow UI: ")).split()[-1]
     answering(server, port)
     yield shown
     os.killpg(server.pid, signal.SIGKILL)
@@ -136,7 +136,9 @@ def test_the_address_opens_on_charts_of_every_run_and_pictures_with_a_slider(pag
     curves = page.locator(".js-plotly-plot .scatterlayer .trace")
     curves.first.wait_for()
     page.wait_for_function("document.querySelectorAll('.js-plotly-plot .scatterlayer .trace').length >= 4")
-    assert re.search(r"score\s*\(6\)", page.inner_text("body"))
+    sections = re.findall(r"(\w+)\s*\(\d+\)", page.inner_text("body"))
+    assert sections[:2] == ["evaluation", "score"]
+    page.get_by_text("pictures", exact=True).last.scroll_into_view_if_needed()  # MLflow draws what is in sight
     picture = page.locator("img[src*='score~histogram']").first
     picture.wait_for()
     assert size_of(picture) == [256, 256]
@@ -147,6 +149,17 @@ def test_the_address_opens_on_charts_of_every_run_and_pictures_with_a_slider(pag
     page.wait_for_function(
         "before => document.querySelector(\"img[src*='score~histogram']\")?.getAttribute('src') != before", arg=before
     )
+
+
+def test_the_first_chart_shows_the_score_of_every_run(page: Any, address: str, outputs: Path) -> None:
+    page.goto("about:blank")  # else only the part behind '#' changes, and the application begins with the old view
+    page.goto(address)
+    chart = page.locator(".js-plotly-plot:has(.barlayer)").first
+    chart.locator(".bartext").first.wait_for()
+    store = Store(outputs)
+    metrics = [store.client.get_run(run.run_id).data.metrics for run in store.runs()]
+    scores = [each["evaluation/interquartile_mean"] for each in metrics if "evaluation/interquartile_mean" in each]
+    assert sorted(chart.locator(".bartext").all_text_contents()) == sorted(f"{score:.2f}" for score in scores)
 
 
 def test_the_sweep_view_has_a_curve_a_group(page: Any, address: str) -> None:

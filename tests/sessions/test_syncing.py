@@ -346,6 +346,19 @@ def test_every_folder_of_the_outputs_is_published_and_stays_at_home(tmp_path: Pa
     assert unfinished(tmp_path / "runs/plain", tmp_path) is None
 
 
+def test_a_store_that_was_thrown_away_is_made_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a_sweep_of_one(tmp_path, "plain")
+    synced(tmp_path)
+    before = shown(tmp_path, "plain")
+    (tmp_path / "mlflow.db").unlink()
+    capsys.readouterr()
+    synced(tmp_path)
+    assert capsys.readouterr().out.endswith(": 2 runs: 2 published\n")
+    assert shown(tmp_path, "plain") == before
+    synced(tmp_path)
+    assert capsys.readouterr().out.endswith(": 2 runs: 2 up to date\n")
+
+
 @pytest.mark.slow
 def test_it_goes_on_looking_until_it_is_interrupted(outputs: Path) -> None:
     command = (sys.executable, "-m", "atlantis_exp", "sync", "every=1s", f"paths.outputs={outputs}")

@@ -153,7 +153,10 @@ def test_a_folder_is_mirrored_whole(tmp_path: Path, root: Path, store: Store) ->
         "top.txt": b"top",
     }
     assert len(shown["files"]) == 2 + 2 * 2  # an image is a full and a small file
-    assert sorted(model[1:] for model in shown["models"]) == [("best", 2, [bytes(step)]) for step in (50, 100)]
+    assert sorted(model[1:] for model in shown["models"]) == [
+        (f"{shown['name']} {step}", 2, [bytes(step)])
+        for step in (100, 50)  # as text
+    ]
     assert [step for _, step in shown["outputs"]] == [50, 100]
     assert {model for model, _ in shown["outputs"]} == {model[0] for model in shown["models"]}
     assert len(shown["model metrics"]) == 2

@@ -106,7 +106,8 @@ def test_the_description_says_how_the_run_stands_and_what_its_last_evaluation_wa
     trainer = small(tmp_path)
     trainer.recorder.about = "Continue with: x"
     trainer.run(lambda: trainer.counters.steps >= 100)
-    assert notes()[0].startswith("Continue with: x\n\n**running** at step 0")
+    assert notes()[0].startswith("**running** at step 0")
+    assert all(note.endswith("\n\nContinue with: x") for note in notes())
     assert "**interrupted** at step 100" in notes()[-1]
     trainer.run()
     recorder = trainer.recorder
