@@ -59,7 +59,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     differences: list[str] = []
     struck = dict.fromkeys(names, 0)
     with tempfile.TemporaryDirectory() as folder:
-        unbroken = {name: _killed(name, Path(folder, name), 0)[1] for name in names}
+        console.print(f"some {options.kills * 5 / 60:,.0f} minutes on two cores; first each training unbroken")
+        unbroken = {}
+        for name in names:
+            _, unbroken[name] = _killed(name, Path(folder, name), 0)
+            console.print(f"unbroken: {name}, {len(unbroken[name])} fingerprints")
         for copy, name in enumerate(itertools.cycle(names)):
             if (left := options.kills - sum(struck.values())) <= 0:
                 break
@@ -67,13 +71,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
             kills, prints = _killed(name, place, min(left, _KILLS_OF_ONE.get(name, left)))
             struck[name] += kills
             console.print(f"copy {copy}: {name}, killed {kills} times; {sum(struck.values()):,} of {options.kills:,}")
-            parts = sorted(part for part in prints if prints[part] != unbroken[name].get(part))
+            parts = sorted({part for part, _ in prints.items() ^ unbroken[name].items()})
             differences += [f"{name}, copy {copy}: {part}" for part in parts]
-            if not parts:
+            if parts:
+                console.print(f"DIFFERENT in {', '.join(parts)}: kept in {place} until this ends")
+            else:
                 shutil.rmtree(place)
     print_table("kills", ("training", "kills"), [(name, f"{kills:,}") for name, kills in struck.items()])
-    for difference in differences:
-        print(f"DIFFERENT {difference}")
     print_results({"kills": sum(struck.values()), "differences": differences})
 
 
