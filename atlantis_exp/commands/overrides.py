@@ -215,7 +215,7 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
             _check_keys(values, _keys(config_name, chosen), groups)
         try:
             composed = _composed(config_name, tuple(texts))
-        except HydraException:  # mostly a key that is not there; to know them all takes as long as to compose
+        except (HydraException, ValueError):  # mostly no such key; to know them all takes as long as to compose
             _check_keys(values, _keys(config_name, chosen), groups)
             raise
         if OmegaConf.select(composed, "plugins") and "plugins" not in {_key(each) for each in overrides.values()}:

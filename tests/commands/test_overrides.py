@@ -188,6 +188,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("seed='☃'", "seed=", "valid integer"),
     # other verbs
     ("query model=cnn", "model=cnn", "no such key"),
+    ("evaluate model=1", "model=1", "no such key"),
     ("query env=atlantis", "env=atlantis", "'atlantis_v"),
     ("query env.siz=1", "env.siz", "'env.size'"),
     ("baseline agent=rndom", "agent=rndom", "'random'"),
