@@ -218,6 +218,20 @@ def test_a_sweep_side_by_side_finds_plugins_and_options_of_one_s_own(
 
 
 @pytest.mark.slow
+def test_a_search_tries_a_network_from_a_file(
+    plugins: Path, command: Command, tiny_overrides: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("optuna", reason="needs pip install 'atlantis-exp[search]'")
+    words = replaced(tiny_overrides, "phase.quick.steps=20", "evaluation.every_steps=null", "paths.outputs=outputs")
+    words += ["plugins=mynet.py", "model=mynet", "model.width=4,12", "trials=2"]
+    assert command("search", *words) == 0, capsys.readouterr().err
+    runs = [RunFolder(path) for path in plugins.glob("outputs/runs/*")]
+    assert {run.state for run in runs} == {"done"}
+    assert {run.config["model"]["name"] for run in runs} == {"mynet"}
+    assert {run.config["model"]["width"] for run in runs} <= {4, 12}
+
+
+@pytest.mark.slow
 def test_a_run_is_evaluated_exported_played_and_compared(
     plugins: Path, command: Command, tiny_overrides: tuple[str, ...], said: Said, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,5 +1,9 @@
 """What `new` writes works as it is."""
 
+import json
+import subprocess
+import sys
+import sysconfig
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,7 +14,7 @@ from atlantis_exp.commands.overrides import check
 from atlantis_exp.components import ENTRY_POINTS, KINDS, admit
 from atlantis_exp.config import Config
 from atlantis_exp.sessions.contracts import trials
-from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.job import Job, replaced
 
 
 @pytest.fixture(autouse=True)
@@ -48,3 +52,30 @@ def test_what_is_written_keeps_every_contract(
 
     assert command("new", f"{kind}=my_own", f"to={folder}") == 2
     assert "is not empty" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)  # seconds
+def test_what_is_written_is_installed_and_chosen_by_its_name(
+    command: Callable[..., int], tiny_overrides: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Installed by pip into an environment of its own, first in place and then as a wheel, which is the same run."""
+    assert command("new", "model=my_own", f"to={tmp_path / 'new'}") == 0
+    subprocess.run([sys.executable, "-m", "venv", tmp_path / "own"], check=True)
+    python = tmp_path / "own" / "bin" / "python"
+    (site,) = (tmp_path / "own").glob("lib/*/site-packages")
+    (site / "ours.pth").write_text(f"import site; site.addsitedir({sysconfig.get_path('purelib')!r})\n")
+    words = replaced(tiny_overrides, "phase.quick.steps=20", "evaluation.at_end=false", "paths.outputs=o")
+
+    def run(*arguments: str) -> str:
+        ended = subprocess.run([python, "-m", *arguments], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert ended.returncode == 0, ended.stdout + ended.stderr
+        return ended.stdout
+
+    for way, said in ((["-e", "./new"], "starting run my_own"), (["--force-reinstall", "./new"], "has ended")):
+        run("pip", "install", "--quiet", "--no-deps", *way)
+        assert "my_own" in run("atlantis_exp", "--help")
+        assert said in run("atlantis_exp", *words, "model=my_own", "plugins=atlantis-my-own")
+    (config,) = (tmp_path / "o" / "runs").glob("*/config.json")
+    (plugin,) = json.loads(config.read_bytes())["plugins"].values()
+    assert plugin["version"] == "0.1.0"

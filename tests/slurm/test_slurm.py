@@ -202,11 +202,12 @@ def test_jobs_that_are_preempted_requeued_timed_out_or_cancelled_end_as_the_unbr
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)  # seconds
-def test_a_decision_has_slurm_train_what_it_needs(
+def test_a_decision_has_slurm_train_what_it_needs_with_a_sampler_from_a_file(
     tiny_overrides: tuple[str, ...], slurm: dict[str, str], tmp_path: Path
 ) -> None:
     chosen = (
-        *("env.max_steps=100,900", "seeds=5", "phase.quick.steps=40", "training.learn_every=10"),
+        *("plugins=examples/paying.py", "sampler=paying", "env.max_steps=100,900", "seeds=5"),
+        *("phase.quick.steps=40", "training.learn_every=10"),
         *("evaluation.every_steps=null", "evaluation.epsilon=0.5", "evaluation.seed=${seed}", "evaluation.episodes=4"),
     )
     words = replaced(tiny_overrides, *chosen, f"paths.outputs={tmp_path}", *LAUNCHER)
@@ -215,6 +216,7 @@ def test_a_decision_has_slurm_train_what_it_needs(
     )
     assert decided.returncode == 0, decided.stdout + decided.stderr
     assert "max_steps=900 plays better than max_steps=100 by" in decided.stdout
-    seeds = sorted(json.loads(path.read_bytes())["seed"] for path in tmp_path.glob("runs/*/config.json"))
-    assert seeds == sorted(2 * list(range(5)))
+    configs = [json.loads(path.read_bytes()) for path in tmp_path.glob("runs/*/config.json")]
+    assert sorted(config["seed"] for config in configs) == sorted(2 * list(range(5)))
+    assert {config["sampler"]["name"] for config in configs} == {"paying"}
     assert len(list(tmp_path.glob("sweeps/*/*/*.out"))) == 10
