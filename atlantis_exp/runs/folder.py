@@ -35,7 +35,7 @@ LOST = "lost"
 """The tag of a run that went on without a part of its replay memory: it is not the unbroken one bit for bit."""
 _HOLD_SECONDS = 2.0  # that a command waits for a run, which another may hold for a moment
 
-State = Literal["done", "running", "failed", "interrupted", "missing"]
+State = Literal["done", "running", "failed", "interrupted", "queued"]
 T = TypeVar("T")
 
 
@@ -145,7 +145,7 @@ class RunFolder:
     def state(self) -> State:
         """How far the run is; one whose process was killed is interrupted, whatever its journal says."""
         if not self.has_started:
-            return "failed" if self.status == "FAILED" else "missing"
+            return "failed" if self.status == "FAILED" else "queued"
         if self.result is not None:
             return "done"
         if self.status == "FAILED":

@@ -129,9 +129,11 @@ def play(
     outputs = Path(paths.outputs)
     catch_up(outputs)
     low, high = (env.frameskip, env.frameskip + 1) if isinstance(env.frameskip, int) else env.frameskip
-    window = Window(env.title, facts_of(env.game), 60 / ((low + high - 1) / 2), scale)  # steps a second, on average
+    game, progress = facts_of(env.game), Progress()
+    progress.say(f"{player} plays {env.title}: {game.keys_in_words}")
+    window = Window(env.title, game, 60 / ((low + high - 1) / 2), scale)  # steps a second, on average
     actor, emulators = build_person(env, window.choose)
-    evaluator, progress = build_evaluator(env, evaluation), Progress()
+    evaluator = build_evaluator(env, evaluation)
     try:
         played = evaluator(actor, evaluation.episodes, progress, lambda: window.closed, emulators)
     except Stopped:

@@ -13,7 +13,7 @@ from atlantis_exp.runs.folder import RunFolder, State
 from atlantis_exp.runs.journal import Metrics, read, read_commit
 from atlantis_exp.sessions.job import Job
 
-_ORDER: tuple[State, ...] = ("running", "failed", "interrupted", "done", "missing")
+_ORDER: tuple[State, ...] = ("running", "failed", "interrupted", "done", "queued")
 
 
 @dataclass
@@ -24,7 +24,7 @@ class _Run:
     folder: RunFolder
     length: int  # of the plan, in its unit
     unit: str
-    state: State = "missing"
+    state: State = "queued"
     values: dict[str, float] = field(default_factory=dict)  # the last ones of each metric
     step: int = 0
     _identity: str = ""
@@ -110,7 +110,7 @@ class LiveTable:
     def _say(self) -> None:
         for run in self._runs:
             name, state, done, speed, left, score = cells = run.cells
-            if self._said.get(name, (name, "missing", "", "", "", "")) != cells:
+            if self._said.get(name, (name, "queued", "", "", "", "")) != cells:
                 self._said[name] = cells
                 parts = [done, speed and f"{speed} steps/s", left and f"left {left}", score and f"last score {score}"]
                 self._console.print(f"  {state:12}{name}  {'  '.join(filter(None, parts))}")

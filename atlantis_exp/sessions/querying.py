@@ -22,6 +22,7 @@ def query(*, env: EnvConfig) -> None:
     print(f"Reward Threshold: {answers['reward_threshold']}")
     print(f"\n{env.id} in this config")
     print(f"frames a step: {frames}, of which each repeats the action before it with probability {env.sticky}")
-    print(f"an episode ends after: {env.max_steps or 'any number of'} steps, {env.max_frames} frames")
+    limits = [*([f"{env.max_steps:,} steps"] if env.max_steps else []), f"{env.max_frames:,} frames"]
+    print(f"an episode ends: when the game is over, or after {' or '.join(limits)}")
     print(f"observation: rows {up}-{down - 1}, columns {left}-{right - 1}, grey, at {env.size}x{env.size} pixels")
     print(f"state: {env.stack} observations")

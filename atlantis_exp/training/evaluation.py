@@ -173,12 +173,13 @@ class Evaluation:
     def report(self) -> str:
         """The evaluation as the report prints it (figures 5.4, 5.5 and 5.9)."""
         summary, best = self.summary, self.best
+        player = "player" if best.values is None else "neural net"
         return (
             f"eval:\n\n"
             f"avg score: {summary.mean}  high score: {summary.high}  low score: {summary.low}\n\n"
             f"interquartile range ({summary.lower_quartile} -> {summary.upper_quartile}) "
             f"mean = {summary.interquartile_mean:.2f}\n\n"
-            f"high score: {best.score}, rand: {best.random_share:.1%} neural net: {1 - best.random_share:.1%}"
+            f"high score: {best.score}, rand: {best.random_share:.1%} {player}: {1 - best.random_share:.1%}"
         )
 
 

@@ -341,4 +341,4 @@ def test_the_end_of_a_decision_has_its_launchers_jobs_commit(
     assert "atlantis_exp: the decision goes on with: python -m atlantis_exp decide" in error
     runs = [RunFolder(path) for path in folder.iterdir()]
     assert not any(run.is_held for run in runs)
-    assert {run.state for run in runs} <= {"interrupted", "missing"}
+    assert {run.state for run in runs} <= {"interrupted", "queued"}

@@ -146,7 +146,9 @@ def test_a_persons_episode_is_a_run_that_a_comparison_finds(
     monkeypatch.setattr(pygame.time, "Clock", lambda: type("Clock", (), {"tick": lambda *_: 0}))
     for _ in range(2):
         play_composed(tmp_path)
-    assert "high score: " in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert printed.startswith("ann plays Atlantis: left, up, right fire a gun each")
+    assert "rand: 0.0% player: 100.0%\n" in printed
     names = ["human-ann-Atlantis-v0-1", "human-ann-Atlantis-v0-2"]
     assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == names
     with open(tmp_path / "runs" / names[0] / "artifacts/evaluation/episodes.csv") as file:

@@ -221,7 +221,7 @@ def test_the_end_of_a_sweep_commits_its_jobs(sweep: Sweep, seeds: Callable[..., 
         os.kill(process.pid, signal.SIGTERM if how == "terminated" else signal.SIGKILL)
     assert process.wait(timeout=60) == {"interrupted": 130, "terminated": 143, "killed": -signal.SIGKILL}[how]
     wait_for(lambda: not any(folder.is_held for folder in folders))
-    assert [folder.state for folder in folders] == ["interrupted", "interrupted", "missing"]
+    assert [folder.state for folder in folders] == ["interrupted", "interrupted", "queued"]
     assert [folder.status for folder in folders[:2]] == ["KILLED", "KILLED"]
     if how != "killed":
         assert statuses(configs[0]) == ["KILLED"] * 3

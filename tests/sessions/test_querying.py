@@ -33,9 +33,9 @@ def test_the_query_prints_figure_1_3_with_todays_answer_on_steps(capsys: pytest.
 def test_the_query_says_what_this_config_makes_of_the_environment(capsys: pytest.CaptureFixture[str]) -> None:
     report = "\n".join(answer(capsys))
     assert "2 to 4" in report
-    assert "27000 steps" in report
+    assert "an episode ends: when the game is over, or after 27,000 steps or 108,000 frames" in report
     assert "rows 16-95, columns 0-159" in report
     standard = "\n".join(answer(capsys, "env=atlantis_standard", "env.sticky=0.5"))
     assert "frames a step: 4" in standard
     assert "probability 0.5" in standard
-    assert "any number of steps, 108000 frames" in standard
+    assert "an episode ends: when the game is over, or after 108,000 frames" in standard

@@ -173,7 +173,7 @@ def test_a_config_that_was_lost_is_written_again(tiny: Compose) -> None:
     config = tiny(*SHORT)
     train(Job(config))
     (RunFolder.of(config).path / "config.json").unlink()
-    assert str(RunFolder.of(config).state) == "missing"
+    assert str(RunFolder.of(config).state) == "queued"
     train(Job(config))
     assert RunFolder.of(config).config == to_dict(config)
     assert RunFolder.of(config).state == "done"
@@ -533,7 +533,7 @@ def test_a_sweep_runs_what_is_missing_and_tables_what_it_found(
     done, error = capsys.readouterr()
     assert error == ""
     tables = [line for line in done.splitlines() if line.startswith("sweep of 2 runs")]
-    assert tables == ["sweep of 2 runs: 1 done, 1 missing", "sweep of 2 runs: 2 done"]
+    assert tables == ["sweep of 2 runs: 1 done, 1 queued", "sweep of 2 runs: 2 done"]
     assert f"run {config.run_name()} has ended" in done
     assert f"starting run {missing.run_name()}" in done
 

@@ -80,6 +80,8 @@ def test_the_actions_are_counted_by_who_chose_them() -> None:
     assert (metrics["evaluation/mean"], metrics["evaluation/truncated_share"]) == (600, 0.5)
     [first, second] = csv.DictReader(io.StringIO(evaluation.table().to_csv()))
     assert (first["score"], first["random"], first["FIRE"], second["truncated"]) == ("300.0", "1", "2", "1")
+    assert evaluation.report().endswith("high score: 900.0, rand: 50.0% player: 50.0%")
+    evaluation.best.raw_values += bytes(2 * 4 * 4)  # of four actions, at two steps
     assert evaluation.report() == (
         "eval:\n\navg score: 600.0  high score: 900.0  low score: 300.0\n\n"
         "interquartile range (450.0 -> 750.0) mean = 600.00\n\n"
