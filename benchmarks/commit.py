@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from atlantis_exp import terminal
 from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.preprocessing import Preprocessing
@@ -45,7 +46,8 @@ def main() -> None:
         for _ in range(steps):
             memory.add(0, 1, 0.0, observations[memory.next_id % len(observations)], False)
 
-    play(CAPACITY)
+    with terminal.working("filling the memory", lambda: f"{memory.next_id:,} of {CAPACITY:,} transitions"):
+        play(CAPACITY)
     network = ResNetDQN((4, SIZE, SIZE), 4)
     # Network, target, and the two moments of the optimizer.
     parts = ("network", "target", "first", "second")

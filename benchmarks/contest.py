@@ -13,6 +13,8 @@ from typing import Any, Generic, Self, TypeVar
 from rich.console import Console
 from rich.table import Table
 
+from atlantis_exp import terminal
+
 T = TypeVar("T")
 Measure = Callable[[float], T]  # of seconds to work for
 
@@ -29,7 +31,8 @@ class Contestant(Generic[T]):
         self._process = context.Process(target=_serve, args=(program, theirs))
         self._process.start()
         theirs.close()
-        self._connection.recv()  # it is warm
+        with terminal.working("warming a contestant up"):
+            self._connection.recv()
 
     def begin(self, seconds: float) -> None:
         """Let it work; `finish` has the result."""
@@ -66,9 +69,17 @@ def _serve(program: Callable[[], AbstractContextManager[Measure[Any]]], connecti
 def take_turns(turns: Mapping[str, Callable[[], T]], rounds: int) -> dict[str, list[T]]:
     """What each call returns, A B C A B C ..., so that a change of the machine's other load meets all alike."""
     results: dict[str, list[T]] = {name: [] for name in turns}
-    for _ in range(rounds):
-        for name, turn in turns.items():
-            results[name].append(turn())
+    total, began = rounds * len(turns), time.monotonic()
+
+    def how_far() -> str:
+        done = sum(map(len, results.values()))
+        left = (time.monotonic() - began) / done * (total - done) if done else None
+        return f"turn {min(done + 1, total)} of {total}" + ("" if left is None else f", {terminal.clock(left)} left")
+
+    with terminal.working("measuring", how_far):
+        for _ in range(rounds):
+            for name, turn in turns.items():
+                results[name].append(turn())
     return results
 
 

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import psutil
 
+from atlantis_exp import terminal
 from atlantis_exp.build import build_learner, make_emulator
 from atlantis_exp.config import EnvConfig
 from atlantis_exp.replay.memory import ReplayMemory, Returns
@@ -123,7 +124,8 @@ def measure_share(model: str, steps: int, transitions: int, rounds: int, seconds
     config = composed(f"model={model}")
     size = config.env.size
     memory = ReplayMemory(transitions + transitions // 100 + 5, (size, size), budget_bytes=config.replay.max_bytes)
-    fill(memory, list(random_play(config.env, steps)), transitions)
+    with terminal.working(f"filling the memory of {model}"):
+        fill(memory, list(random_play(config.env, steps)), transitions)
     learner = build_learner(config)
     rng = np.random.default_rng(1)
     batch = memory.gather(memory.draw(BATCHES[model], rng), RETURNS)
@@ -178,7 +180,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows: list[tuple[str, ...]] = []
 
     for case in (case for case in CASES if case.name in args.cases):
-        with multiprocessing.get_context("spawn").Pool(1) as fresh_process:
+        filling = terminal.working(f"filling the memory of {case.name}")
+        with filling, multiprocessing.get_context("spawn").Pool(1) as fresh_process:
             row = fresh_process.apply(measure, (case, args.steps, args.transitions))
         rows.append(
             (

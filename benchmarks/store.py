@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from atlantis_exp import terminal
 from atlantis_exp.checking import to_dict
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.compare import VERB as COMPARE
@@ -151,7 +152,8 @@ def main(arguments: Sequence[str] = ()) -> None:
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="store-", dir=".") as place:
         outputs = Path(place).resolve()
-        jobs = write_runs(outputs, options.runs, options.episodes, options.distinct)
+        with terminal.working("writing the runs"):
+            jobs = write_runs(outputs, options.runs, options.episodes, options.distinct)
         size = (RunFolder.of(jobs[0].config).path / "journal.jsonl").stat().st_size
         of = f"paths.outputs={outputs}"
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import emulation, kills, learner, overhead, replay, startup, store, training
+from benchmarks import emulation, evaluation, kills, learner, overhead, replay, startup, store, training
 from benchmarks.contest import paired_ratio, ratio, take_turns
 
 Main = Callable[[Sequence[str]], None]
@@ -69,6 +69,16 @@ def test_emulation_measures_every_contestant(capsys: pytest.CaptureFixture[str])
 
 
 @pytest.mark.slow
+def test_evaluation_is_related_to_emulation_and_pass_and_a_film_to_its_processor_time(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    arguments = "--num-envs 4 --rounds 1 --seconds 0.2 --film-steps 100"
+    results = results_of(evaluation.main, arguments, capsys)
+    assert 0 < results["of_limit"] < 2
+    assert results["film_seconds"] > 0
+
+
+@pytest.mark.slow
 def test_replay_measures_memory_and_sampling(capsys: pytest.CaptureFixture[str]) -> None:
     results = results_of(replay.main, "--cases 84 --steps 200 --transitions 400 --rounds 1 --seconds 0.05", capsys)
     assert results["transitions_84"] == 400
@@ -90,6 +100,19 @@ def test_learner_relates_its_arithmetic_to_the_machines(capsys: pytest.CaptureFi
     results = results_of(learner.main, "--cases cnn_fp32 --rounds 1 --seconds 0.1 --against training.ema=10", capsys)
     assert 0 < results["gemm_share_cnn_fp32"] < 1.5
     assert 0 < results["against_cnn_fp32"] < 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("native", ["bf16", "fp32"])
+def test_bfloat16_is_measured_where_it_is_native(
+    native: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = tuple(learner.Case("cnn", 2, precision) for precision in ("bf16", "fp32"))
+    monkeypatch.setattr(learner, "CASES", small)
+    monkeypatch.setattr(learner, "choose_precision", lambda *_: native)
+    results = results_of(learner.main, "--rounds 1 --seconds 0.1", capsys)
+    assert ("gemm_share_cnn_bf16" in results) == (native == "bf16")
+    assert "gemm_share_cnn_fp32" in results
 
 
 def test_a_mistaken_override_of_a_learner_is_told(capsys: pytest.CaptureFixture[str]) -> None:
