@@ -93,7 +93,7 @@ def _cores() -> int:
 
     That is where launchers (joblib, Ray, Slurm's scripts) say it, and where torch looks for its threads.
     """
-    cores = len(os.sched_getaffinity(0))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1  # macOS has none
     share = os.environ.get("OMP_NUM_THREADS", "")
     return min(cores, int(share)) if share.isdecimal() and int(share) else cores
 
@@ -102,6 +102,8 @@ def choose_device(name: str) -> torch.device:
     """The device of that name; `auto` is the GPU where there is one. Raises: ConfigError."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name == "mps" and not torch.backends.mps.is_available():
+        raise ConfigError("device=mps: this machine has no Apple GPU; valid: auto, cpu")
     count = torch.cuda.device_count()
     if name.startswith("cuda") and int(name.partition(":")[2] or 0) >= count:
         raise ConfigError(f"device={name}: this machine has {count or 'no'} CUDA devices; valid: auto, cpu")

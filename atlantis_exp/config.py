@@ -35,7 +35,7 @@ Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Share = Annotated[float, Field(gt=0, lt=1)]
-Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
+Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$")]
 
 FREE = frozenset(("plugins", "resume", "device", "threads", "compile", "tracking", "budget", "paths"))
 """The keys that say how a run is done; of `plugins`, those that its components are of are part of what is trained."""

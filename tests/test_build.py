@@ -1,12 +1,16 @@
 """What is built from a config, counted."""
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from atlantis_exp.build import build_learner
+import pytest
+
+from atlantis_exp.build import build_emulators, build_learner
 from atlantis_exp.config import Config
+from atlantis_exp.game.vector import ProcessEmulators
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -39,3 +43,17 @@ def test_a_network_plays_without_what_it_was_learned_by() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
+
+
+def test_emulators_share_the_cores_where_the_system_does_not_say_which_are_ours(
+    tiny: Callable[..., Config], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on macOS."""
+    monkeypatch.delattr(os, "sched_getaffinity")
+    monkeypatch.delattr(os, "sched_setaffinity")
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    with build_emulators(tiny("env.num_envs=3", "env.workers=null").env, 3) as emulators:
+        assert isinstance(emulators, ProcessEmulators)
+        assert len(emulators._processes) == 2
+        emulators.reset(range(3), [0, 1, 2])

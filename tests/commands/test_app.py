@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from atlantis_exp.commands import VERBS
@@ -17,6 +18,9 @@ from atlantis_exp.config import Config
 
 REPOSITORY = Path(__file__).parents[2]
 Command = Callable[..., int]
+
+
+HAS_MPS = torch.backends.mps.is_available()
 
 
 @pytest.mark.parametrize(
@@ -30,6 +34,7 @@ Command = Callable[..., int]
         "seed=1 seed=2 paths.outputs=o",
         "replay.capacity=1000000000000000000 paths.outputs=o",
         "device=cuda:99 paths.outputs=o",
+        pytest.param("device=mps paths.outputs=o", marks=pytest.mark.skipif(HAS_MPS, reason="this machine has one")),
         "new to=o",
         "new model=mynet",
     ],

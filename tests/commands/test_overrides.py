@@ -77,7 +77,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("env.id=Pong-v0", "env.id=Pong-v0", "ALE/Atlantis-v5, Atlantis-v0"),
     ("resume=maybe", "resume=maybe", "auto, must, never"),
     ("objective.target.mode=trian", "objective.target.mode=trian", "'train'"),
-    ("device=gpu", "device=", "auto|cpu|cuda"),
+    ("device=gpu", "device=", "auto|cpu|mps|cuda"),
     # types and ranges
     ("optimizer.lr=abc", "optimizer.lr", "valid number"),
     ("optimizer.lr=true", "optimizer.lr", "valid number"),
