@@ -283,8 +283,8 @@ def build_plan(config: cfg.Config) -> Plan:
     )
 
 
-def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Actor:
-    """The player that a training of this config has made, from its network as safetensors.
+def build_trained_network(config: cfg.Config, weights: bytes) -> nn.Module:
+    """The network that a training of this config has made, from its weights as safetensors.
 
     Raises:
         Fault: where the weights are damaged or another network's.
@@ -293,15 +293,21 @@ def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Acto
         tensors = safetensors.torch.load(weights)
         with torch.device("meta"):  # shapes first: a card may claim a network that no memory holds
             _architecture(config).load_state_dict(tensors, assign=True)
-        where = choose_device(device)
-        network = build_network(config, "network").to(where)
+        network = build_network(config, "network")
         network.load_state_dict(tensors)
-        precision = choose_precision(config.training.precision, where)
-        values = ActionValues(network, precision=precision, shards=_share_cores(config, where))  # type: ignore[arg-type]
     except Fault:  # of a plugin
         raise
     except (SafetensorError, RuntimeError) as error:
         raise Fault(f"the weights are damaged or another network's: {' '.join(str(error).split())}") from error
+    return network
+
+
+def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Actor:
+    """The player that a training of this config has made, from its weights as safetensors. Raises: Fault."""
+    where = choose_device(device)
+    network = build_trained_network(config, weights).to(where)
+    precision = choose_precision(config.training.precision, where)
+    values = ActionValues(network, precision=precision, shards=_share_cores(config, where))  # type: ignore[arg-type]
     return EpsilonGreedy(values.q_values, _num_actions(config), watches=True)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from atlantis_exp import build
-from atlantis_exp.sessions.cards import MOST_BYTES, build_exported_actor, read_card
+from atlantis_exp.sessions.cards import MOST_BYTES, build_exported_actor, metadata, read_card
 from atlantis_exp.training.actor import EpsilonGreedy
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -18,6 +18,7 @@ def test_a_folder_is_what_its_card_says(folder: Path) -> None:
     card, weights = read_card(folder)  # which checks the schema and the checksum
     assert len(weights) <= MOST_BYTES
     page = (folder / "README.md").read_text()
+    assert page.startswith(metadata(folder.name, card))
     assert card.sha256 in page
     assert f"evaluate weights=pretrained/{folder.name} " in page
     actor = build_exported_actor(card.config, weights, "cpu")

@@ -19,6 +19,7 @@ class ExportConfig:
     run: str
     weights: Literal["latest", "best"]
     to: Annotated[str, Field(min_length=1)] | None
+    onnx: bool
     device: Device
     evaluation: EvaluationConfig
     paths: PathsConfig

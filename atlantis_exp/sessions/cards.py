@@ -71,10 +71,18 @@ def read_card(folder: Path) -> tuple[Card, bytes]:
     return card, weights
 
 
-def write_card(folder: Path, card: Card, weights: bytes, evaluation: Evaluation) -> None:
-    """Fill a folder with the weights, their card, and the page that says the same to people."""
+def write_card(folder: Path, card: Card, weights: bytes, evaluation: Evaluation, onnx: bytes | None = None) -> None:
+    """Fill a folder with the weights, their card, and the page that says the same to people and to model hubs."""
     (folder / "weights.safetensors").write_bytes(weights)
-    (folder / "README.md").write_text(_page(folder, card, len(weights), evaluation))
+    files = f"`weights.safetensors`: {len(weights):,} bytes, {card.precision}, sha256 `{card.sha256}`."
+    if onnx is not None:
+        (folder / "network.onnx").write_bytes(onnx)
+        env = card.config.env
+        files += (
+            f"\n\n`network.onnx`: {len(onnx):,} bytes, float32: `states`, uint8 (batch, {env.stack}, {env.size}, "
+            f"{env.size}), to `q_values`, float32 (batch, actions)."
+        )
+    (folder / "README.md").write_text(_page(folder, card, files, evaluation))
     (folder / "card.json").write_text(json.dumps(to_dict(card), indent=2) + "\n")
 
 
@@ -138,7 +146,27 @@ def _points(settings: EvaluationConfig, scores: Sequence[float]) -> Iterator[str
     yield from (str(setting) for setting in (summary.episodes, settings.epsilon, settings.seed))
 
 
-def _page(folder: Path, card: Card, size: int, evaluation: Evaluation) -> str:
+def metadata(name: str, card: Card) -> str:
+    """The YAML that model hubs read at the top of a page; each value as JSON, which is YAML, too."""
+    game = card.config.env.id.rsplit("/")[-1]
+    reward = f"{np.mean(card.scores):.2f} +/- {np.std(card.scores):.2f}"
+    task = {"type": "reinforcement-learning", "name": "reinforcement-learning"}
+    result = {
+        "task": task,
+        "dataset": {"type": game, "name": game},
+        "metrics": [{"type": "mean_reward", "value": reward, "name": "mean_reward", "verified": False}],
+    }
+    facts = {
+        "license": "mit",
+        "library_name": "atlantis-exp",
+        "pipeline_tag": "reinforcement-learning",
+        "tags": ["reinforcement-learning", "deep-reinforcement-learning", "atari", game, card.config.model.name],
+        "model-index": [{"name": name, "results": [result]}],
+    }
+    return "\n".join(["---", *(f"{key}: {json.dumps(value)}" for key, value in facts.items()), "---"])
+
+
+def _page(folder: Path, card: Card, files: str, evaluation: Evaluation) -> str:
     env = to_dict(card.config.env)
     del env["num_envs"], env["workers"]
     training = {
@@ -151,7 +179,9 @@ def _page(folder: Path, card: Card, size: int, evaluation: Evaluation) -> str:
     }
     place = folder if len(folder.parts) > 1 and not folder.is_absolute() else f"./{folder.name}"
     what = f"{card.config.model.name} with {card.config.objective.name}"
-    return f"""# {folder.name}
+    return f"""{metadata(folder.name, card)}
+
+# {folder.name}
 
 Weights of a network that plays Atari {card.config.env.title}: {what}.
 
@@ -182,7 +212,7 @@ curve at or before the step.
 
 ## File
 
-`weights.safetensors`: {size:,} bytes, {card.precision}, sha256 `{card.sha256}`.
+{files}
 
 ## Licence
 

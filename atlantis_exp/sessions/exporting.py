@@ -6,12 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+from atlantis_exp import terminal
 from atlantis_exp.build import build_evaluator
 from atlantis_exp.config import EvaluationConfig, PathsConfig
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder, find_run
 from atlantis_exp.runs.journal import Metrics, Tags, read
 from atlantis_exp.sessions.cards import Card, build_exported_actor, pack, portable, write_card
+from atlantis_exp.sessions.onnx import export_onnx, require
 from atlantis_exp.sessions.weights import stored_weights
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.training.progress import Progress
@@ -22,11 +24,14 @@ def export(
     run: str,
     weights: Literal["latest", "best"],
     to: str | None,
+    onnx: bool,
     device: str,
     evaluation: EvaluationConfig,
     paths: PathsConfig,
 ) -> None:
     """Play the network as it will be handed on, then write it with a card of how it was made and what it scored."""
+    if onnx:
+        require()
     outputs = Path(paths.outputs)
     catch_up(outputs)
     source = find_run(outputs, run)
@@ -36,6 +41,10 @@ def export(
     packed, precision = pack(stored)
     reached, made = _history(source, step)
     actor = build_exported_actor(trained, packed, device)
+    exported = None
+    if onnx:
+        with terminal.working("writing the network as ONNX, and asking both about the same states"):
+            exported = export_onnx(trained, packed)
     folder.mkdir(parents=True, exist_ok=True)  # before the episodes, lest there be no place for their scores
     if any(folder.iterdir()):
         raise ConfigError(f"to={folder}: is not empty; name another folder")
@@ -56,8 +65,10 @@ def export(
         evaluation=settings,
         scores=[episode.score for episode in played.episodes],
     )
-    write_card(folder, card, packed, played)
+    write_card(folder, card, packed, played, exported and exported.content)
     print(f"\n{played.report()}\n\n{len(packed):,} bytes in {precision}, with card and scores, in {folder}")
+    if exported:
+        print(f"network.onnx: within {exported.difference:.1g} of torch's values in {exported.states} states")
 
 
 def _history(run: RunFolder, step: int) -> tuple[dict[str, float], dict[str, str]]:

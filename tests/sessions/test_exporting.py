@@ -8,15 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import safetensors.numpy
+import yaml
 
 from atlantis_exp.comparison.gather import gather, group, plays_alike
 from atlantis_exp.comparison.tables import compare
 from atlantis_exp.comparison.verdict import Question
 from atlantis_exp.config import Config
-from atlantis_exp.sessions import cards
-from atlantis_exp.sessions.cards import read_card
+from atlantis_exp.sessions import cards, onnx
+from atlantis_exp.sessions.cards import build_exported_actor, read_card
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.training import train
+from atlantis_exp.training.actor import EpsilonGreedy
 
 Command = Callable[..., int]
 Compose = Callable[..., Config]
@@ -50,6 +52,10 @@ def test_exported_weights_score_what_their_card_says(
     assert len(card.scores) == 3
     assert len(set(card.scores)) > 1
     page = (folder / "README.md").read_text()
+    metadata = yaml.safe_load(page.split("---\n")[1])
+    assert (metadata["license"], metadata["tags"][-1]) == ("mit", "cnn")
+    (result,) = metadata["model-index"][0]["results"]
+    assert result["metrics"][0]["value"] == f"{np.mean(card.scores):.2f} +/- {np.std(card.scores):.2f}"
     assert card.sha256 in page
     assert f"| {np.mean(card.scores):,.0f} |" in page
     assert not any(str(trained) in path.read_text() for path in (folder / "README.md", folder / "card.json"))
@@ -89,3 +95,32 @@ def test_an_export_neither_overwrites_nor_starts_without_weights(
     assert not (tmp_path / "new").exists()
     assert command("export", outputs, "weights=latest", f"to={tmp_path}") == 2
     assert capsys.readouterr().err == f"atlantis_exp: to={tmp_path}: is not empty; name another folder\n"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["cnn", "resnet", "resnet_fast", "cnn_small"])
+def test_a_network_as_onnx_says_what_it_says_in_torch(
+    command: Command, tiny: Compose, tmp_path: Path, capsys: pytest.CaptureFixture[str], model: str
+) -> None:
+    onnxruntime = pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
+    config = tiny(f"model={model}", "env.size=40", "objective=quantile", "evaluation.at_end=false")
+    train(Job(config))
+    folder, outputs = tmp_path / "exported", f"paths.outputs={config.paths.outputs}"
+    assert command("export", f"to={folder}", "weights=latest", "episodes=1", "onnx=true", outputs) == 0
+    assert re.search(r"network\.onnx: within \S+ of torch's values in \d{2,} states", capsys.readouterr().out)
+    assert "network.onnx" in (folder / "README.md").read_text()
+    card, weights = read_card(folder)
+    states = np.random.default_rng(0).integers(0, 256, (3, 4, 40, 40), np.uint8)
+    session = onnxruntime.InferenceSession(folder / "network.onnx", providers=["CPUExecutionProvider"])
+    (values,) = session.run(None, {"states": states})
+    actor = build_exported_actor(card.config, weights, "cpu")
+    assert isinstance(actor, EpsilonGreedy)
+    np.testing.assert_allclose(values, actor.q_values(states), rtol=1e-4, atol=1e-5)
+
+
+def test_onnx_without_its_extra_is_one_line(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(onnx, "find_spec", lambda _: None)
+    assert command("export", "onnx=true", f"paths.outputs={tmp_path}") == 2
+    assert capsys.readouterr().err == "atlantis_exp: onnx=true: needs pip install 'atlantis-exp[onnx]'\n"
