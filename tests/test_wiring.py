@@ -251,7 +251,7 @@ def test_a_training_that_will_not_fit_is_refused_before_it_begins_unless_a_warni
     assert command(*replaced(words, "budget.forecast=refuse")) == 1
     shown = capsys.readouterr()
     assert re.fullmatch(rf"atlantis_exp: {shortage}.*; budget\.forecast=warn starts all the same\n", shown.err)
-    assert re.search(r"^expect about [\d,]+ steps/s, \d+ minutes for 20 steps, ", shown.out, re.MULTILINE)
+    assert re.search(r"^expect about [\d,]+ steps/s, \d+ seconds for 20 steps, ", shown.out, re.MULTILINE)
     assert not list(tmp_path.glob("runs/*/checkpoints/*/manifest.json"))
     if memory < disk:  # once is enough
         assert command(*replaced(words, "budget.forecast=warn")) == 0
