@@ -83,6 +83,16 @@ def gemm_of(precision: str) -> Callable[[], None]:
     return multiply
 
 
+def chosen(names: Sequence[str] | None) -> list[Case]:
+    """The cases of these names; without any, all but those whose format this machine emulates."""
+    if names is not None:
+        return [case for case in CASES if case.name in names]
+    if choose_precision("auto", choose_device("auto")) == "bf16":
+        return [*CASES]
+    print("bfloat16 is emulated here: its cases are left out; --cases cnn_bf16 measures one", flush=True)
+    return [case for case in CASES if case.precision != "bf16"]
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table and the JSON line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.learner", description="the learner's FLOP rate")
@@ -91,11 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--rounds", type=int, default=7, help="turns of each case")
     parser.add_argument("--seconds", type=float, default=2.0, help="length of a turn")
     args = parser.parse_args(arguments)
-    native = choose_precision("auto", choose_device("cpu")) == "bf16"
-    cases = [case for case in CASES if case.name in (args.cases or [case.name])]
-    if args.cases is None and not native:
-        cases = [case for case in cases if case.precision != "bf16"]
-        print("this processor emulates bfloat16: its cases are left out; --cases cnn_bf16 measures one", flush=True)
+    cases = chosen(args.cases)
     try:
         others = {case: case.config(*args.against) for case in cases if args.against}
     except ConfigError as error:

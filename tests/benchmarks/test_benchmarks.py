@@ -102,17 +102,16 @@ def test_learner_relates_its_arithmetic_to_the_machines(capsys: pytest.CaptureFi
     assert 0 < results["against_cnn_fp32"] < 10
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("native", ["bf16", "fp32"])
-def test_bfloat16_is_measured_where_it_is_native(
-    native: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_bfloat16_is_measured_where_it_is_native_or_asked_for(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    small = tuple(learner.Case("cnn", 2, precision) for precision in ("bf16", "fp32"))
-    monkeypatch.setattr(learner, "CASES", small)
-    monkeypatch.setattr(learner, "choose_precision", lambda *_: native)
-    results = results_of(learner.main, "--rounds 1 --seconds 0.1", capsys)
-    assert ("gemm_share_cnn_bf16" in results) == (native == "bf16")
-    assert "gemm_share_cnn_fp32" in results
+    monkeypatch.setattr(learner, "choose_precision", lambda *_: "bf16")
+    assert learner.chosen(None) == [*learner.CASES]
+    monkeypatch.setattr(learner, "choose_precision", lambda *_: "fp32")
+    assert {case.precision for case in learner.chosen(["cnn_bf16"])} == {"bf16"}
+    assert capsys.readouterr().out == ""
+    assert {case.name for case in learner.chosen(None)} == {"cnn_fp32", "resnet_fp32"}
+    assert "bfloat16 is emulated here" in capsys.readouterr().out
 
 
 def test_a_mistaken_override_of_a_learner_is_told(capsys: pytest.CaptureFixture[str]) -> None:
