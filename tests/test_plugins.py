@@ -526,31 +526,39 @@ def test_the_examples_are_trained(command: Command, tiny_overrides: tuple[str, .
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("page", ["extending", "first-hour"])
 def test_the_page_does_what_it_says(
-    command: Command, tiny_overrides: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: Command, tiny_overrides: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, page: str
 ) -> None:
-    """Every command of docs/extending.md, on its own network, smaller and shorter."""
-    page = (ROOT / "docs" / "extending.md").read_text()
-    (network,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    (tmp_path / "mynet.py").write_text(network)
-    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    """Every command of the page, on its own network, smaller and shorter."""
+    text = (ROOT / "docs" / f"{page}.md").read_text()
+    for network in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        (tmp_path / "mynet.py").write_text(network)
+    for folder in ("examples", "pretrained"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
     monkeypatch.chdir(tmp_path)
-    lines = [line for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL) for line in block.splitlines()]
+    blocks = "".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL))
+    (recipe,) = re.findall(r"^run: .*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    lines = blocks.replace("make run\n", recipe.replace("\t$(BIN)/", "")).splitlines()
     place = f"paths.outputs={tmp_path / 'outputs'}"
     quick = replaced(tiny_overrides, "phase.quick.steps=20", "evaluation.every_steps=null", place)
-    played = ("episodes=1", "evaluation.video=false", "evaluation.num_envs=1", place)
+    played = ("episodes=1", "evaluation.video=false", "evaluation.num_envs=1", "tracking=none", place)
     more: dict[str, list[str]] = {
         "decide": ["--cfg", "job"],
         "check": ["--cfg", "job"],
-        "baseline": ["evaluation.episodes=1", *played[1:], "env.max_steps=20", "tracking=none"],
+        "new": [],
+        "report": [place],
+        "baseline": [*played[1:], "evaluation.episodes=1", "env.max_steps=20"],
         "compare": ["tracking=none", place],
-        "evaluate": [*played, "tracking=none"],
-        "export": [*played],
+        "evaluate": [*played, "epsilon=1"],
+        "export": [word for word in played if not word.startswith("tracking")],
     }
     for line in lines:
-        words = shlex.split(line)
+        words = shlex.split(re.sub("(.*) --cfg job$", r"\1", line))
         assert words[:3] == ["python", "-m", "atlantis_exp"]
         first, *rest = words[3:]
-        words = [first, *rest, *more[first]] if first in more else replaced(quick, first, *rest)
-        assert command(*sorted(words, key=lambda word: word != "-m")) == 0, line
-    assert {line.split()[3] for line in lines} >= {*more, "-m", "model=mynet"}
+        words = [first, *replaced(rest, *more[first])] if first in more else replaced([first, *rest], *quick)
+        shown = ["--cfg", "job"] if line.endswith("--cfg job") else []
+        assert command(*sorted(words, key=lambda word: word != "-m"), *shown) == 0, line
+    firsts = {line.split()[3] for line in lines}
+    assert firsts >= {"decide", "check", "compare", "evaluate", "-m"}

@@ -151,6 +151,7 @@ def test_kills_counts_them_and_finds_no_difference(capsys: pytest.CaptureFixture
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1_200)  # twelve trainings before it begins
 def test_startup_relates_each_command_to_importing_torch(capsys: pytest.CaptureFixture[str]) -> None:
     results = results_of(startup.main, "--rounds 1", capsys)
     assert {*startup.TARGETS} < {*results}
