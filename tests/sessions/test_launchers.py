@@ -25,6 +25,7 @@ from atlantis_exp.runs.journal import Journal, read_commit
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.launchers import BASIC, Launcher
 from atlantis_exp.sessions.launchers.joblib import _shared_cores
+from atlantis_exp.sessions.launchers.ray import _start
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.training import train
 from atlantis_exp.sessions.verifying import fingerprints
@@ -225,6 +226,21 @@ def test_the_end_of_a_sweep_commits_its_jobs(sweep: Sweep, seeds: Callable[..., 
     assert [folder.status for folder in folders[:2]] == ["KILLED", "KILLED"]
     if how != "killed":
         assert statuses(configs[0]) == ["KILLED"] * 3
+
+
+def test_without_an_address_ray_starts_a_cluster_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it would join one that another sweep has started on this machine."""
+    ray = pytest.importorskip("ray", reason="the extra ray is not installed")
+    for name in ("RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"):
+        monkeypatch.setenv(name, "0")
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    asked: list[object] = []
+    monkeypatch.setattr(ray, "init", lambda **settings: asked.append(settings["address"]))
+    _start({"address": None})
+    _start({"address": "127.0.0.1:6379"})
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:6380")
+    _start({"address": None})
+    assert asked == ["local", "127.0.0.1:6379", None]
 
 
 @pytest.mark.slow

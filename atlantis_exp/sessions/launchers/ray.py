@@ -26,6 +26,7 @@ def _start(settings: Mapping[str, Any]) -> None:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     if settings.get("address") is None and "RAY_ADDRESS" not in os.environ:
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # what is started listens to 127.0.0.1 only
+        settings = {**settings, "address": "local"}  # None would join the cluster of another sweep on this machine
     import ray
 
     ray.init(**settings)
