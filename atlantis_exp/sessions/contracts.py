@@ -154,7 +154,8 @@ def _there_and_back(config: Config) -> None:
 @contextmanager
 def _no_global_stream() -> Iterator[None]:
     def streams() -> list[Any]:
-        return [torch.get_rng_state().tolist(), np.random.get_state()[1].tolist(), random.getstate()]  # type: ignore[index]  # noqa: NPY002
+        numpys: Any = np.random.get_state()  # noqa: NPY002
+        return [torch.get_rng_state().tolist(), numpys[1].tolist(), random.getstate()]
 
     before = streams()
     yield

@@ -151,7 +151,7 @@ def probed(one: Network, other: Network, values: Values, other_values: Values) -
         "equal_by_chance": float(shares[0] @ shares[1]),
         "equal_where_clear": float(equal[clear].mean()) if clear.any() else float("nan"),
         "advantage_distance": float(np.abs(advantages[0] - advantages[1]).mean()),
-        "state_value_correlation": float(spearmanr(*highest).statistic) if varies else float("nan"),
+        "state_value_correlation": float(spearmanr(highest[0], highest[1]).statistic) if varies else float("nan"),
     }
 
 

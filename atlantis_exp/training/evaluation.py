@@ -107,7 +107,7 @@ class Evaluation:
     def favourite(self) -> tuple[str, float]:
         """The action that the network chose most often, and its share of the network's decisions; 0 if it had none."""
         chosen = self.action_counts[:, 0]
-        return self.game.actions[int(chosen.argmax())], float(chosen.max() / max(1, chosen.sum()))
+        return self.game.actions[int(chosen.argmax())], int(chosen.max()) / max(1, int(chosen.sum()))
 
     @property
     def collapsed(self) -> bool:

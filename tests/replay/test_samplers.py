@@ -30,7 +30,7 @@ def test_the_uniform_sampler_draws_once_and_keeps_all() -> None:
 
 @pytest.mark.parametrize("oversample", [1, 2, 5])
 def test_top_half_is_the_sorted_draw_cut_to_the_batch(oversample: int) -> None:
-    rewards = np.random.default_rng(0).choice([0.0, 0.0, 0.0, 100.0, 200.0, -1.0], 300)
+    rewards = np.random.default_rng(0).choice(np.array([0.0, 0.0, 0.0, 100.0, 200.0, -1.0]), 300)
     memory = memory_with_rewards(rewards)
     for seed in range(20):
         draw = memory.draw(oversample * 16, np.random.default_rng(seed)).tolist()
