@@ -5,7 +5,7 @@ from torch import nn
 
 from atlantis_exp.components import component
 from atlantis_exp.networks.heads import Head
-from atlantis_exp.networks.sizes import convolved
+from atlantis_exp.networks.sizes import check_sides, convolved
 
 
 @component("cnn_small", "model")
@@ -22,8 +22,7 @@ class SmallCnn(nn.Module):
     def __init__(self, input_shape: tuple[int, int, int], num_actions: int, head: Head = nn.Linear) -> None:
         super().__init__()
         channels, height, width = input_shape
-        if min(height, width) < self.smallest_side:
-            raise ValueError(f"SmallCnn needs {self.smallest_side} pixels a side at least, not {height}x{width}")
+        check_sides(type(self).__name__, self.smallest_side, height, width)
         self.features = nn.Sequential(  # 84x84
             nn.Conv2d(channels, 16, kernel_size=8, stride=4),  # 20x20
             nn.ReLU(),

@@ -6,7 +6,7 @@ from torch import nn
 from atlantis_exp.components import component
 from atlantis_exp.networks.dropout import Dropout
 from atlantis_exp.networks.heads import Head
-from atlantis_exp.networks.sizes import convolved
+from atlantis_exp.networks.sizes import check_sides, convolved
 
 
 class ResNetBlock(nn.Module):
@@ -54,8 +54,7 @@ class ResNetDQN(nn.Module):
     def __init__(self, input_shape: tuple[int, int, int], num_actions: int, head: Head = nn.Linear) -> None:
         super().__init__()
         channels, height, width = input_shape
-        if min(height, width) < self.smallest_side:
-            raise ValueError(f"ResNetDQN needs {self.smallest_side} pixels a side at least, not {height}x{width}")
+        check_sides(type(self).__name__, self.smallest_side, height, width)
         self.block1 = nn.Sequential(  # 159x159
             nn.Conv2d(channels, 16, kernel_size=3, stride=2),  # 79x79
             nn.SiLU(inplace=True),

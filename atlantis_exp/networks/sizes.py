@@ -1,6 +1,12 @@
-"""How large things are: feature maps after a convolution, networks in parameters."""
+"""How large things are: inputs at least, feature maps after a convolution, networks in parameters."""
 
 from torch import nn
+
+
+def check_sides(network: str, smallest: int, height: int, width: int) -> None:
+    """Raise ValueError where a side of a network's input, in pixels, is below the smallest that it takes."""
+    if min(height, width) < smallest:
+        raise ValueError(f"{network} needs {smallest} pixels a side at least, not {height}x{width}")
 
 
 def convolved(side: int, kernel: int, stride: int, padding: int = 0) -> int:
