@@ -13,7 +13,6 @@ from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder, find_run
 from atlantis_exp.runs.journal import Metrics, Tags, read
 from atlantis_exp.sessions.cards import Card, build_exported_actor, pack, portable, write_card
-from atlantis_exp.sessions.onnx import export_onnx, require
 from atlantis_exp.sessions.weights import stored_weights
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.training.progress import Progress
@@ -31,6 +30,8 @@ def export(
 ) -> None:
     """Play the network as it will be handed on, then write it with a card of how it was made and what it scored."""
     if onnx:
+        from atlantis_exp.sessions.onnx import export_onnx, require  # and scipy, a second that plain exports do without
+
         require()
     outputs = Path(paths.outputs)
     catch_up(outputs)
