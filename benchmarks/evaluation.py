@@ -26,7 +26,7 @@ from atlantis_exp.build import build_evaluator, make_emulator
 from atlantis_exp.game.vector import SerialEmulators
 from atlantis_exp.sessions.cards import build_exported_actor, read_card
 from atlantis_exp.training.actor import Actor
-from atlantis_exp.training.evaluation import Stopped, evaluate
+from atlantis_exp.training.evaluation import Stopped
 from atlantis_exp.training.evaluator import Evaluator
 from atlantis_exp.training.film import film_episode
 from atlantis_exp.training.progress import Progress
@@ -51,15 +51,6 @@ def player(folder: str, num_envs: int, max_steps: int | None = None) -> tuple[Ac
 def evaluating(folder: str, num_envs: int) -> Iterator[Measure[float]]:
     """Games as `evaluate` plays them, begun anew in each turn."""
     actor, evaluator = player(folder, num_envs)
-    emulators = evaluator.make_emulators(num_envs)
-    play = functools.partial(
-        evaluate,
-        episodes=num_envs,
-        epsilon=evaluator.epsilon,
-        seed=evaluator.seed,
-        size=evaluator.size,
-        stack=evaluator.stack,
-    )
 
     def measure(seconds: float) -> float:
         marks: list[float] = []
@@ -69,11 +60,10 @@ def evaluating(folder: str, num_envs: int) -> Iterator[Measure[float]]:
             return len(marks) > _WARM_STEPS and marks[-1] - marks[_WARM_STEPS] >= seconds
 
         with suppress(Stopped):
-            play(actor, emulators, stop=stop)
+            evaluator(actor, num_envs, _QUIET, stop)
         return num_envs * (len(marks) - 1 - _WARM_STEPS) / (marks[-1] - marks[_WARM_STEPS])
 
-    with emulators:
-        yield measure
+    yield measure
 
 
 @contextmanager
@@ -128,7 +118,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seconds", type=float, default=5.0, help="length of a turn")
     parser.add_argument("--film-steps", type=int, default=27_000, help="of the filmed game")
     args = parser.parse_args(arguments)
-    minutes = (3.5 * args.rounds * args.seconds + 0.4 * args.num_envs + args.film_steps / 300) / 60
+    minutes = (
+        args.rounds * (3.5 * args.seconds + 0.15 * args.num_envs) + 0.3 * args.num_envs + args.film_steps / 300
+    ) / 60
     print(f"about {minutes:.0f} minutes", file=sys.stderr, flush=True)
     with ExitStack() as stack:
 
