@@ -37,6 +37,8 @@ def export(
     catch_up(outputs)
     source = find_run(outputs, run)
     folder = Path(to or f"pretrained/{source.name}")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise ConfigError(f"to={folder}: is not empty; name another folder")
     trained = portable(source.trained_config)
     stored, step = stored_weights(source, weights)
     packed, precision = pack(stored)
@@ -47,8 +49,6 @@ def export(
         with terminal.working("writing the network as ONNX, and asking both about the same states"):
             exported = export_onnx(trained, packed)
     folder.mkdir(parents=True, exist_ok=True)  # before the episodes, lest there be no place for their scores
-    if any(folder.iterdir()):
-        raise ConfigError(f"to={folder}: is not empty; name another folder")
     settings = replace(evaluation, video=False, num_envs=evaluation.at_once)
     progress = Progress()
     progress.say(f"{source.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")

@@ -1,6 +1,5 @@
 """Groups' networks asked themselves: about the same archived states, and where their games of one seed part."""
 
-import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import spearmanr
 
+from atlantis_exp import terminal
 from atlantis_exp.build import make_emulator
 from atlantis_exp.comparison.comparing import Probed, slug
 from atlantis_exp.comparison.gather import Training
@@ -27,14 +27,12 @@ from atlantis_exp.sessions.cards import build_exported_actor
 from atlantis_exp.sessions.weights import stored_weights
 from atlantis_exp.training.actor import EpsilonGreedy
 from atlantis_exp.training.film import Moment, QValues, greedy_moments
-from atlantis_exp.training.progress import Progress
 
 SEED = 3_000_017  # of the game that all pairs play
 MOST_STEPS = 2_000  # of that game, in which a pair parts or does not
 BEFORE_SECONDS, FILM_SECONDS = 1, 20  # of game time: before the parting, and the whole film
 _MOST_GROUPS = 4  # whose pairs are all asked
 _BATCH = 16  # states
-_QUIET_SECONDS = 3.0  # between two lines of progress
 _GAME = ("frameskip", "sticky", "noop_max")  # settings that make another game of the same seed and actions
 
 Values = npt.NDArray[np.float32]  # (states, actions)
@@ -64,7 +62,12 @@ def probe_groups(outputs: Path, groups: Mapping[str, Sequence[Training]], baseli
     Of more than four groups each is compared with one only: the first that the baseline names, or the first. A network
     that cannot be asked is named in a note; everything else goes on.
     """
-    tell = _Teller()
+    said = deque([""], maxlen=1)
+    with terminal.working("asking the networks", lambda: said[0]):
+        return _probe_groups(outputs, groups, baseline, said.append)
+
+
+def _probe_groups(outputs: Path, groups: Mapping[str, Sequence[Training]], baseline: str | None, tell: Tell) -> Probed:
     notes: list[str] = []
     archive = None
     if (game := next(iter(groups.values()))[0].game) is not None and game.beside("states.npz").is_file():
@@ -265,15 +268,3 @@ def _parting_in_words(row: Row) -> str:
             f"where the film ends they have {row['later_score']:,.0f} and {row['other_later_score']:,.0f}"
         )
     return f"Where the games of {row['group']} and {row['other']} part: {where}."
-
-
-class _Teller:
-    """Prints what is said to it, but not all of it: a line every few seconds."""
-
-    def __init__(self) -> None:
-        self._progress, self._said = Progress(), float("-inf")
-
-    def __call__(self, text: str) -> None:
-        if time.monotonic() - self._said >= _QUIET_SECONDS:
-            self._said = time.monotonic()
-            self._progress.say(text)

@@ -71,9 +71,12 @@ class Snapshot:
     updates: int
     steps_per_second: float
     phase: str
-    done: int  # of the plan, in its unit
-    length: int  # of the plan, in its unit
-    steps_left: float | None  # None where nothing tells
+    steps_left: float | None  # until the plan or the budget ends; None where nothing tells
+
+    @property
+    def share(self) -> float:
+        """How much of the training is done, in steps."""
+        return 0.0 if self.steps_left is None else self.steps / (self.steps + max(self.steps_left, 0.0))
 
 
 class Progress:
@@ -101,7 +104,7 @@ class Progress:
             self.say(_line(snapshot))
             return
         table = Table.grid(padding=(0, 1))
-        table.add_row(ProgressBar(total=snapshot.length, completed=snapshot.done, width=24), _line(snapshot))
+        table.add_row(ProgressBar(total=1.0, completed=snapshot.share, width=24), _line(snapshot))
         if self._live is None:
             self._live = Live(table, console=self.console, transient=True, auto_refresh=False)
             self._live.start()
@@ -161,7 +164,7 @@ def _line(snapshot: Snapshot) -> str:
     return (
         f"episode {snapshot.episode:,}  {shown}  epsilon {snapshot.epsilon:.2f}  "
         f"step {snapshot.steps:,}  updates {snapshot.updates:,}  {snapshot.steps_per_second:,.0f} steps/s  "
-        f"phase {snapshot.phase}  {snapshot.done / snapshot.length:.1%}  left {_time_left(snapshot)}"
+        f"phase {snapshot.phase}  {snapshot.share:.1%}  left {_time_left(snapshot)}"
     )
 
 

@@ -263,7 +263,5 @@ class Recorder:
             updates=self.learner.updates,
             steps_per_second=self._pace.steps_per_second,
             phase=self.plan.phase_at(counters).name,
-            done=done,
-            length=length,
             steps_left=left,
         )

@@ -65,8 +65,6 @@ SNAPSHOT = Snapshot(
     updates=3_000,
     steps_per_second=1_234.4,
     phase="fast",
-    done=1_012,
-    length=8_000,
     steps_left=930_000.9,
 )
 
@@ -80,17 +78,25 @@ def line_of(snapshot: Snapshot) -> str:
 def test_a_line_says_how_far_a_training_is() -> None:
     assert line_of(SNAPSHOT) == (
         "episode 1,013  score 3,000  mean of 20 1,100  duration 812 (mean of 100 801)  epsilon 0.12  "
-        "step 12,345  updates 3,000  1,234 steps/s  phase fast  12.7%  left 0:12:33\n"
+        "step 12,345  updates 3,000  1,234 steps/s  phase fast  1.3%  left 0:12:33\n"
     )
 
 
 def test_the_line_of_a_first_episode_has_no_score_yet() -> None:
     first = replace(
-        SNAPSHOT, episode=1, scores=[], lengths=[], steps=0, updates=0, steps_per_second=0.0, done=0, steps_left=None
+        SNAPSHOT, episode=1, scores=[], lengths=[], steps=0, updates=0, steps_per_second=0.0, steps_left=None
     )
     assert line_of(first) == (
         "episode 1  first episode  epsilon 0.12  step 0  updates 0  0 steps/s  phase fast  0.0%  left ?\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("steps", "steps_left", "share"),
+    [(0, None, "0.0%"), (250, 750.0, "25.0%"), (1_000, 0.0, "100.0%"), (1_003, -3.0, "100.0%")],
+)
+def test_the_share_is_of_all_steps_until_the_end(steps: int, steps_left: float | None, share: str) -> None:
+    assert f"  {share}  left " in line_of(replace(SNAPSHOT, steps=steps, steps_left=steps_left))
 
 
 @pytest.mark.parametrize(
