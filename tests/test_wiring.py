@@ -33,6 +33,7 @@ Command = Callable[..., int]
 Started = Callable[[Config, Path], Trainer]
 
 RETURNS = "Returns(gamma=0.99, n_step=1, scale=1.0, clip=None)"
+FURTHER_RETURNS = "Returns(gamma=0.997, n_step=5, scale=1.0, clip=None)"
 ADAM = {"lr": 1e-3, "betas": (0.9, 0.999), "eps": 1e-8, "fused": True}
 RMSPROP = {"centered": True, "weight_decay": 0, "foreach": True}
 TARGET = {"tau": 1e-4, "target_every": 1, "target_mode": "eval"}
@@ -46,6 +47,8 @@ BUILT: dict[str, dict[str, Any]] = {  # group, option: what it builds
         "double_dqn": {"class": "DoubleDQN", "outputs": 4, "returns": RETURNS, **TARGET},
         "quantile": {"class": "Quantile", "outputs": 4 * 51, "returns": RETURNS, **TARGET},
         "double_quantile": {"class": "DoubleQuantile", "outputs": 4 * 51, "returns": RETURNS, **TARGET},
+        "rescaled_double_dqn": {"class": "RescaledDoubleDQN", "outputs": 4, "returns": FURTHER_RETURNS, **TARGET},
+        "rescaled_quantile": {"class": "RescaledQuantile", "outputs": 4 * 51, "returns": FURTHER_RETURNS, **TARGET},
     },
     "optimizer": {
         "adam": {"class": "Adam", "weight_decay": 0.0, **ADAM},
@@ -336,5 +339,5 @@ def test_without_a_terminal_a_line_now_and_then_says_how_far_a_training_is(monke
         "episode 23  score 12,345  mean of 20 1,662  duration 1,210 (mean of 100 1,105)  epsilon 0.46  step 2,000  "
         "updates 4,000  100 steps/s  phase first  20.0%  left 0:01:20",
         "episode 23  score 12,345  mean of 20 1,662  duration 1,210 (mean of 100 1,105)  epsilon 0.46  step 3,000  "
-        "updates 6,000  100 steps/s  phase first  30.0%  left 0:00:05",
+        "updates 6,000  100 steps/s  phase first  85.7%  left 0:00:05",
     ]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Protocol, TypeAlias
+from typing import Annotated, ClassVar, Literal, Protocol, TypeAlias
 
 import torch
 from annotated_types import Interval
@@ -44,15 +44,13 @@ class DQN:
     """The target network chooses the next action and values it (Mnih et al. 2015; report figure 2.5)."""
 
     def targets(
-        self,
-        r_t: torch.Tensor,
-        s_tpm: torch.Tensor,
-        discount: torch.Tensor,
-        online: QFunction,  # noqa: ARG002 - only Double DQN asks it
-        target: QFunction,
+        self, r_t: torch.Tensor, s_tpm: torch.Tensor, discount: torch.Tensor, online: QFunction, target: QFunction
     ) -> torch.Tensor:
+        return bootstrapped(r_t, discount, self._next_values(s_tpm, online, target))
+
+    def _next_values(self, s_tpm: torch.Tensor, online: QFunction, target: QFunction) -> torch.Tensor:  # noqa: ARG002
         q = target(s_tpm)
-        return bootstrapped(r_t, discount, taken(q, action_values(q).argmax(1)))
+        return taken(q, action_values(q).argmax(1))
 
     def losses(self, q: torch.Tensor, a_t: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         return smooth_l1_loss(taken(q, a_t), target, reduction="none")
@@ -67,11 +65,8 @@ class DoubleDQN(DQN):
     which s_tpm therefore leaves alone.
     """
 
-    def targets(
-        self, r_t: torch.Tensor, s_tpm: torch.Tensor, discount: torch.Tensor, online: QFunction, target: QFunction
-    ) -> torch.Tensor:
-        a_tpm = action_values(online(s_tpm)).argmax(1)
-        return bootstrapped(r_t, discount, taken(target(s_tpm), a_tpm))
+    def _next_values(self, s_tpm: torch.Tensor, online: QFunction, target: QFunction) -> torch.Tensor:
+        return taken(target(s_tpm), action_values(online(s_tpm)).argmax(1))
 
 
 @component("quantile", "objective")
@@ -99,6 +94,63 @@ class Quantile(DQN):
 @dataclass(frozen=True)
 class DoubleQuantile(Quantile, DoubleDQN):
     """QR-DQN whose online network chooses the next action, as in Double DQN; the target network gives its quantiles."""
+
+
+@dataclass(frozen=True)
+class _Rescaled(DQN):
+    """Learns h(return) for an h that makes large returns small, so that rewards need no clip; h is undone before
+    rewards are added (Pohlen et al. 2018, equation 5)."""
+
+    rescaling: Literal["signed_sqrt", "symlog"]
+
+    def targets(
+        self, r_t: torch.Tensor, s_tpm: torch.Tensor, discount: torch.Tensor, online: QFunction, target: QFunction
+    ) -> torch.Tensor:
+        rescale, undo = RESCALINGS[self.rescaling]
+        return rescale(bootstrapped(r_t, discount, undo(self._next_values(s_tpm, online, target))))
+
+
+@component("rescaled_double_dqn", "objective")
+@dataclass(frozen=True)
+class RescaledDoubleDQN(_Rescaled, DoubleDQN):
+    """Double DQN on rescaled returns, as in R2D2 (Kapturowski et al. 2019)."""
+
+
+@component("rescaled_quantile", "objective")
+@dataclass(frozen=True)
+class RescaledQuantile(_Rescaled, Quantile):
+    """QR-DQN on rescaled returns, whose quantiles are those of the returns, rescaled.
+
+    Actions are chosen by the mean of what is learned, which is below the rescaled mean where returns vary.
+    """
+
+
+_EPSILON = 1e-3  # keeps h's inverse from growing without bound (Pohlen et al. 2018, proposition A.2)
+
+
+def signed_sqrt(x: torch.Tensor) -> torch.Tensor:
+    """Return sign(x) (sqrt(|x| + 1) - 1) + .001 x (Pohlen et al. 2018)."""
+    return x.sign() * ((x.abs() + 1).sqrt() - 1) + _EPSILON * x
+
+
+def undo_signed_sqrt(x: torch.Tensor) -> torch.Tensor:
+    """Return what `signed_sqrt` makes x of (Pohlen et al. 2018, proposition A.2)."""
+    inside = x.abs() + 1 + _EPSILON
+    # The paper's (root - 1) / (2 epsilon) times (root + 1) / (root + 1): in float32 the difference loses digits.
+    return x.sign() * ((2 * inside / ((1 + 4 * _EPSILON * inside).sqrt() + 1)) ** 2 - 1)
+
+
+def symlog(x: torch.Tensor) -> torch.Tensor:
+    """Return sign(x) log(|x| + 1) (Hafner et al. 2023)."""
+    return x.sign() * x.abs().log1p()
+
+
+def undo_symlog(x: torch.Tensor) -> torch.Tensor:
+    """Return what `symlog` makes x of."""
+    return x.sign() * x.abs().expm1()
+
+
+RESCALINGS = {"signed_sqrt": (signed_sqrt, undo_signed_sqrt), "symlog": (symlog, undo_symlog)}
 
 
 def td_errors(q: torch.Tensor, a_t: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,6 @@
-from typing import Any
+import math
+from collections.abc import Callable
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -6,7 +8,17 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from atlantis_exp.learning.objectives import DQN, DoubleDQN, DoubleQuantile, Quantile, action_values, td_errors
+from atlantis_exp.learning.objectives import (
+    DQN,
+    RESCALINGS,
+    DoubleDQN,
+    DoubleQuantile,
+    Quantile,
+    RescaledDoubleDQN,
+    RescaledQuantile,
+    action_values,
+    td_errors,
+)
 
 every_seed = given(seed=st.integers(0, 1000))
 
@@ -67,9 +79,68 @@ def test_double_quantile_targets_are_the_target_network_s_of_the_online_network_
     )
 
 
+def _signed_sqrt(x: float) -> float:
+    """Pohlen et al. 2018, proposition A.2, as printed."""
+    return math.copysign(math.sqrt(abs(x) + 1) - 1, x) + 0.001 * x
+
+
+def _undo_signed_sqrt(x: float) -> float:
+    return math.copysign(((math.sqrt(1 + 0.004 * (abs(x) + 1 + 0.001)) - 1) / 0.002) ** 2 - 1, x)
+
+
+WRITTEN_OUT: dict[str, tuple[Callable[[float], float], Callable[[float], float]]] = {
+    "signed_sqrt": (_signed_sqrt, _undo_signed_sqrt),
+    "symlog": (
+        lambda x: math.copysign(math.log(abs(x) + 1), x),
+        lambda x: math.copysign(math.exp(abs(x)) - 1, x),
+    ),
+}
+
+
+@pytest.mark.parametrize("rescaling", WRITTEN_OUT)
+@given(x=st.floats(-1e6, 1e6, width=32))
+def test_a_rescaling_is_the_paper_s_and_is_undone(rescaling: str, x: float) -> None:
+    rescale, undo = RESCALINGS[rescaling]
+    made = rescale(torch.tensor(x))
+    assert made.item() == pytest.approx(WRITTEN_OUT[rescaling][0](x), rel=1e-5, abs=1e-6)
+    assert undo(made).item() == pytest.approx(x, rel=1e-4, abs=1e-5)
+
+
+@pytest.mark.parametrize("rescaling", WRITTEN_OUT)
+@every_seed
+def test_rescaled_targets_are_of_returns_and_of_the_action_with_the_best_rescaled_value(
+    rescaling: Literal["signed_sqrt", "symlog"], seed: int
+) -> None:
+    rescale, undo = WRITTEN_OUT[rescaling]
+    rewards, discounts, online, target, now = _batch(seed)
+    plain = RescaledDoubleDQN(rescaling)
+    targets = plain.targets(rewards, torch.arange(9), discounts, lambda s: online[s], lambda s: target[s])
+    for b in range(9):
+        best = max(range(4), key=lambda action: float(online[b, action]))
+        expected = rescale(float(rewards[b]) + float(discounts[b]) * undo(float(target[b, best])))
+        assert targets[b].item() == pytest.approx(expected, rel=1e-4, abs=1e-4)
+    actions = torch.arange(9) % 4
+    torch.testing.assert_close(plain.losses(now, actions, targets), DQN().losses(now, actions, targets))
+
+    rewards, discounts, online, target, now = _batch(seed, 5)
+    quantiles = RescaledQuantile(5, rescaling)
+    targets = quantiles.targets(rewards, torch.arange(9), discounts, lambda s: online[s], lambda s: target[s])
+    for b in range(9):
+        best = max(range(4), key=lambda action: sum(target[b, action].tolist()))
+        for j in range(5):
+            expected = rescale(float(rewards[b]) + float(discounts[b]) * undo(float(target[b, best, j])))
+            assert targets[b, j].item() == pytest.approx(expected, rel=1e-4, abs=1e-4)
+    torch.testing.assert_close(quantiles.losses(now, actions, targets), Quantile(5).losses(now, actions, targets))
+
+
 @pytest.mark.parametrize(
     ("objective", "shape"),
-    [(DQN(), (2, 4)), (DoubleDQN(), (2, 4)), (Quantile(5), (2, 4, 3)), (DoubleQuantile(5), (2, 4, 3))],
+    [
+        (DQN(), (2, 4)),
+        (DoubleDQN(), (2, 4)),
+        (Quantile(5), (2, 4, 3)),
+        (DoubleQuantile(5), (2, 4, 3)),
+    ],
     ids=str,
 )
 def test_nothing_comes_through_a_cut_bootstrap(objective: DQN | Quantile, shape: tuple[int, ...]) -> None:
