@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -9,8 +10,9 @@ from typing import Any
 
 import pytest
 
-from benchmarks import emulation, evaluation, kills, learner, overhead, replay, startup, store, training
+from benchmarks import emulation, evaluation, kills, learner, overhead, replay, startup, store, time_to_score, training
 from benchmarks.contest import paired_ratio, ratio, take_turns
+from benchmarks.time_to_score import Turn, hours_to, sooner
 
 Main = Callable[[Sequence[str]], None]
 
@@ -157,3 +159,26 @@ def test_startup_relates_each_command_to_importing_torch(capsys: pytest.CaptureF
     assert {*startup.TARGETS} < {*results}
     assert all(share > 0 for share in results.values())
     assert results["help"] < 1
+
+
+def test_the_time_to_a_score_is_that_of_the_first_turn_that_has_it() -> None:
+    turns = {
+        "ours": [Turn(0.5, 10, 100.0), Turn(0.25, 20, 300.0), Turn(0.5, 30, 200.0)],
+        "slow": [Turn(1.0, 10, 100.0), Turn(2.0, 20, 150.0), Turn(4.5, 30, 200.0)],
+        "slower": [Turn(9.0, 10, 120.0)],
+    }
+    assert [hours_to(goal, turns["ours"]) for goal in (100, 101, 200, 301)] == [0.5, 0.75, 0.75, math.inf]
+    assert sooner(100, turns) == (2.0, False)
+    assert sooner(200, turns) == (10.0, False)
+    assert sooner(201, turns) == (12.0, True)  # the longest that a peer tried
+    assert sooner(301, turns) is None
+    assert sooner(100, {"ours": turns["ours"]}) is None
+
+
+@pytest.mark.slow
+def test_the_time_to_score_trains_in_turns_and_plays_after_each(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = "--contestants ours --minutes 0.1 --turn 0.05 --episodes 2 --cut 40"
+    results = results_of(time_to_score.main, arguments, capsys)
+    first, second = results["curves"]["ours"]
+    assert first[1] < second[1]
+    assert results["hours"]["62500"]["ours"] is None

@@ -1,0 +1,233 @@
+"""Which score after which time, ours and the peers: `python -m benchmarks.time_to_score --minutes 180`.
+
+`experiment=fast` with DQNCnn, sb3-contrib's QR-DQN with RL Zoo's settings for Atari, and Stable-Baselines3's DQN with
+those of CleanRL's `dqn_atari.py` (whose loss is squared, not Huber's). Each is a process of its own that has all cores
+in its turn and rests while the others have theirs, as in `benchmarks.training`; after each turn its network plays a few
+games, at one epsilon for all and on the clock of none. Ours trains and plays in the report's game (two to four frames a
+step, sticky actions), the peers in theirs, `AtlantisNoFrameskip-v4` with SB3's `AtariWrapper` (four frames a step, no
+sticky actions). Until the last turn games are cut after --cut steps, so that scores above are at least as shown.
+"""
+
+import argparse
+import functools
+import itertools
+import math
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+
+from atlantis_exp.build import build_evaluator, build_trainer
+from atlantis_exp.config import Config
+from atlantis_exp.runs.journal import NullJournal
+from atlantis_exp.training.actor import EpsilonGreedy, States
+from atlantis_exp.training.progress import Progress
+from benchmarks.composition import composed
+from benchmarks.contest import Contestant, Measure, missing, print_results, print_table, take_turns
+
+GOALS = (25_240, 62_500)  # the report's best mean, and its best game
+
+_ACTIONS = 4
+_STEPS = 10_000_000  # that the peers' schedules are made for: RL Zoo's and CleanRL's
+_CAPACITY = 400_000  # transitions; theirs is 1,000,000, which no run of hours fills and few machines hold
+_QUIET = Progress(Console(quiet=True))
+
+
+class Turn(NamedTuple):
+    """What a turn of training has led to."""
+
+    hours: float  # that this turn trained for
+    steps: int  # trained so far
+    score: float  # mean
+
+
+@dataclass
+class Judge:
+    """Plays a few games with a network after each of so many turns."""
+
+    episodes: int
+    cut: int  # steps of a game, but in the last turn
+    turns: int
+    judged: int = 0
+
+    def __call__(self, config: Config, q_values: Callable[[States], npt.NDArray[np.float32]]) -> float:
+        """The mean score in a config's environment, at its epsilon of evaluations."""
+        self.judged += 1
+        env = config.env if self.judged == self.turns else replace(config.env, max_steps=self.cut)
+        evaluator = build_evaluator(env, replace(config.evaluation, num_envs=self.episodes))
+        return evaluator(EpsilonGreedy(q_values, _ACTIONS), self.episodes, _QUIET).summary.mean
+
+
+@contextmanager
+def ours(judge: Judge, *overrides: str) -> Iterator[Measure[Turn]]:
+    """Our recipe."""
+    quiet = ("evaluation.at_end=false", "evaluation.every_steps=null", "evaluation.video=false")
+    config = composed("experiment=fast", *quiet, *overrides)
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        trainer = build_trainer(config, Path(folder), NullJournal(), _QUIET)
+        stack.callback(trainer.emulators.close)
+
+        def measure(seconds: float) -> Turn:
+            began = time.perf_counter()
+            trainer.run(lambda: time.perf_counter() - began >= seconds)
+            hours = (time.perf_counter() - began) / 3600
+            return Turn(hours, trainer.counters.steps, judge(config, trainer.learner.evaluated_q_values))
+
+        yield measure
+
+
+@contextmanager
+def stable_baselines3(judge: Judge, make: Callable[[Any], Any]) -> Iterator[Measure[Turn]]:
+    """A model of SB3's in the environment that RL Zoo gives it."""
+    import ale_py  # noqa: F401  # registers the environment
+    import torch
+    from stable_baselines3.common.env_util import make_atari_env
+    from stable_baselines3.common.vec_env import VecFrameStack
+
+    env = VecFrameStack(make_atari_env("AtlantisNoFrameskip-v4", seed=0), 4)
+    model = make(env)
+    config = composed("env=atlantis_standard", "env.sticky=0", "env.noop_max=30")  # as AtariWrapper plays
+
+    def q_values(states: States) -> npt.NDArray[np.float32]:
+        with torch.no_grad():
+            q = model.q_net(torch.from_numpy(states))  # scales bytes itself
+        values: npt.NDArray[np.float32] = q.numpy()
+        return values
+
+    def quantile_values(states: States) -> npt.NDArray[np.float32]:
+        with torch.no_grad():
+            z = model.quantile_net(torch.from_numpy(states))  # (B, N, A)
+        values: npt.NDArray[np.float32] = z.mean(1).numpy()
+        return values
+
+    values = quantile_values if hasattr(model, "quantile_net") else q_values
+
+    def measure(seconds: float) -> Turn:
+        began = time.perf_counter()
+        # SB3 adds the steps so far to the total, which its schedules are a share of.
+        model.learn(
+            _STEPS - model.num_timesteps,
+            lambda *_: time.perf_counter() - began < seconds,
+            reset_num_timesteps=not model.num_timesteps,
+        )
+        hours = (time.perf_counter() - began) / 3600
+        model.policy.set_training_mode(False)
+        return Turn(hours, model.num_timesteps, judge(config, values))
+
+    try:
+        yield measure
+    finally:
+        env.close()
+
+
+def sb3_qrdqn(env: Any) -> Any:
+    """RL Zoo's `hyperparams/qrdqn.yml` names no more than the wrapper, the stack and these."""
+    from sb3_contrib import QRDQN
+
+    return QRDQN("CnnPolicy", env, buffer_size=_CAPACITY, seed=0, **_THRIFTY)
+
+
+def cleanrl_dqn(env: Any) -> Any:
+    """The settings of CleanRL's `dqn_atari.py`."""
+    from stable_baselines3 import DQN
+
+    return DQN(
+        "CnnPolicy",
+        env,
+        learning_rate=1e-4,
+        buffer_size=_CAPACITY,
+        learning_starts=80_000,
+        batch_size=32,
+        gamma=0.99,
+        train_freq=4,
+        target_update_interval=1_000,
+        exploration_fraction=0.1,
+        exploration_initial_eps=1.0,
+        exploration_final_eps=0.01,
+        max_grad_norm=0.5,
+        seed=0,
+        **_THRIFTY,
+    )
+
+
+_THRIFTY: Any = {
+    "optimize_memory_usage": True,
+    "replay_buffer_kwargs": {"handle_timeout_termination": False},  # which excludes optimize_memory_usage
+}
+PROGRAMS: dict[str, Callable[[Judge], AbstractContextManager[Measure[Turn]]]] = {
+    "ours": ours,
+    "sb3_qrdqn": functools.partial(stable_baselines3, make=sb3_qrdqn),
+    "cleanrl_dqn": functools.partial(stable_baselines3, make=cleanrl_dqn),
+}
+
+
+def hours_to(goal: float, turns: Sequence[Turn]) -> float:
+    """The training after which a score was first reached, infinite where it was not."""
+    hours = itertools.accumulate(turn.hours for turn in turns)
+    return next((now for now, turn in zip(hours, turns, strict=True) if turn.score >= goal), math.inf)
+
+
+def sooner(goal: float, turns: dict[str, list[Turn]]) -> tuple[float, bool] | None:
+    """How many times sooner ours reached a score than the best peer, and whether it is at least so many, as no peer has
+    reached it; None where ours has not, or there are no peers."""
+    reached = {name: hours_to(goal, each) for name, each in turns.items()}
+    own = reached.pop("ours", math.inf)
+    if math.isinf(own) or not reached:
+        return None
+    best = min(reached.values())
+    longest = max(sum(turn.hours for turn in turns[name]) for name in reached)
+    return min(best, longest) / own, math.isinf(best)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Train in turns, print."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.time_to_score")
+    parser.add_argument("--contestants", nargs="*", choices=PROGRAMS, default=list(PROGRAMS))
+    parser.add_argument("--minutes", type=float, default=6.0, help="training of each; for a result: 180")
+    parser.add_argument("--turn", type=float, default=2.0, help="minutes of a turn; for a result: 10")
+    parser.add_argument("--episodes", type=int, default=5, help="games after a turn")
+    parser.add_argument("--cut", type=int, default=8_000, help="steps of such a game, until the last turn")
+    args = parser.parse_args(arguments)
+    peers = [name for name in args.contestants if name != "ours"]
+    left_out = bool(peers) and (missing("stable_baselines3") | missing("sb3_contrib"))
+    names = [name for name in args.contestants if not (left_out and name in peers)]
+    rounds = max(1, round(args.minutes / args.turn))
+    print(f"some {1.2 * args.minutes * len(names):.0f} minutes", file=sys.stderr, flush=True)
+    with ExitStack() as stack:
+        judge = Judge(args.episodes, args.cut, rounds)
+        contestants = {
+            name: stack.enter_context(Contestant(functools.partial(PROGRAMS[name], judge))) for name in names
+        }
+        calls = {name: functools.partial(one.measure, 60 * args.turn) for name, one in contestants.items()}
+        turns = take_turns(calls, rounds)
+    print_table(
+        f"mean of {args.episodes} games after hours of training; * cut after {args.cut:,} steps",
+        ("", *(f"{number * args.turn / 60:.2f} h" for number in range(1, rounds + 1))),
+        [
+            (name, *(f"{turn.score:,.0f}{'*' * (turn is not each[-1])}" for turn in each))
+            for name, each in turns.items()
+        ],
+    )
+    results: dict[str, Any] = {"hours": {}, "curves": turns}
+    for goal in GOALS:
+        hours = {name: hours_to(goal, each) for name, each in turns.items()}
+        results["hours"][goal] = {name: None if math.isinf(value) else value for name, value in hours.items()}
+        told = ", ".join(f"{name} {'not' if math.isinf(value) else f'{value:.2f} h'}" for name, value in hours.items())
+        print(f"to {goal:,}: {told}")
+        if found := sooner(goal, turns):
+            times, at_least = found
+            print(f"  ours {'at least ' if at_least else ''}{times:.1f} times sooner than the best of the others")
+            results[f"sooner_{goal}"] = times
+    print_results(results)
+
+
+if __name__ == "__main__":
+    main()
