@@ -2,7 +2,7 @@
 
 import csv
 import io
-from math import isnan
+from math import isnan, nan
 from typing import Any
 
 from atlantis_exp.components import Component, facts_of
@@ -19,12 +19,25 @@ def scores(game: Component | None) -> Table:
     source = "dqn_zoo/atari_data.py (Quan and Ostrovski 2020)"
     return [
         *(
-            {"name": name, "score": score, "kind": "player", "protocol": "published, no-op starts", "source": source}
+            {
+                "name": name,
+                "score": score,
+                "points_per_frame": nan,
+                "kind": "player",
+                "protocol": "published, no-op starts",
+                "source": source,
+            }
             for name, score in players.items()
             if not isnan(score)
         ),
-        *_read(game, "scores.csv"),
+        *map(_with_rate, _read(game, "scores.csv")),
     ]
+
+
+def _with_rate(row: Row) -> Row:
+    """Whoever survives plays as many frames as the cap allows; of anybody else it is the least that the rate can be."""
+    capped = row.pop("capped_frames", "")
+    return {**row, "points_per_frame": row["score"] / float(capped) if capped else nan}
 
 
 def curves(game: Component | None) -> Table:

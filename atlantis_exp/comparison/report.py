@@ -123,7 +123,13 @@ COLUMNS = {
         "later_score": "group's score at the film's end",
         "other_later_score": "other's",
     },
-    "references": {"name": "player", "score": "score", "protocol": "protocol", "source": "source"},
+    "references": {
+        "name": "player",
+        "score": "score",
+        "points_per_frame": "points per frame",
+        "protocol": "protocol",
+        "source": "source",
+    },
     "skipped": {"run": "run", "reason": "why it is left out"},
 }
 """The tables that the page shows: their columns and how a person calls them."""

@@ -386,6 +386,7 @@ def _measured(player: Player) -> Row:
     return {
         "name": f"{player.called}, measured",
         "score": float(scores.mean()),
+        "points_per_frame": float(scores.sum() / frames) if (frames := player.episodes.frames.sum()) else _NAN,
         "kind": "player",
         "protocol": f"{scores.size} episodes under the runs' own settings",
         "source": player.name,

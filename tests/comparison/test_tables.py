@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from math import isnan
 from pathlib import Path
 
 import numpy as np
@@ -255,6 +256,10 @@ def test_what_is_published_has_a_protocol_and_a_source() -> None:
     )
     assert published["random player"]["score"] == 12_850
     assert published["GDI-H3"]["score"] == 3_837_300
+    assert published["R2D2"]["points_per_frame"] == pytest.approx(15.0, abs=0.05)  # under a cap of 108,000 frames
+    assert published["DQN (Nature)"]["points_per_frame"] == pytest.approx(4.76, abs=0.01)  # five minutes
+    assert isnan(published["GDI-H3"]["points_per_frame"])  # whose cap nobody knows
+    assert len({frozenset(row) for row in rows}) == 1
     assert all(row["source"] and row["seeds"] == 5 for row in curves(ATLANTIS))
 
 
