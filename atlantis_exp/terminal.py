@@ -5,9 +5,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from rich.console import Console
 
+_HERE = Path(__file__).parent
+PROGRAM = "atlantis-exp" if (_HERE / "conf").is_dir() else "python -m atlantis_exp"
+"""What a person calls: an installed wheel, which brings the config groups, by the name of its command."""
 LINE_SECONDS = 4.0  # between two lines of what is under way: nothing is silent for five
 _FIRST_SECONDS = 1.0  # what takes less needs no line
 

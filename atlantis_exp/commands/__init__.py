@@ -31,8 +31,6 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 CHECKOUT = _PACKAGE.parent
 CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else CHECKOUT / "conf"
 """The config groups, those of a checkout or those that an installed package brings."""
-PROGRAM = "python -m atlantis_exp" if CONF.parent == CHECKOUT else "atlantis-exp"
-"""What a person calls."""
 
 
 def main() -> None:

@@ -4,7 +4,8 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from atlantis_exp.commands import CONF, PROGRAM, VERBS
+from atlantis_exp.commands import CONF, VERBS
+from atlantis_exp.terminal import PROGRAM
 
 _GROUP = re.compile(r" +- (?P<preset>override /)?(?P<group>[\w@.]+): (?P<option>\w+)\s*(?:#.*)?")
 _KEY = re.compile(r"(?P<indent> *)(?P<key>\w+):(?P<value>.*?)\s*(?:#(?P<comment>.*))?")

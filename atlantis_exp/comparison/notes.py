@@ -11,6 +11,7 @@ from atlantis_exp.comparison.verdict import Answer, counted
 from atlantis_exp.components import Component, facts_of
 from atlantis_exp.decision import FEWEST_SEEDS, equal_scores
 from atlantis_exp.runs.folder import LOST
+from atlantis_exp.terminal import PROGRAM
 
 _NAMED = 6  # runs, up to which a line names them
 
@@ -219,7 +220,7 @@ def other_players(facts: Facts) -> Iterator[str]:
     if random_player["protocol"].startswith("published"):
         yield (
             "No random player was measured under these settings, so a published one takes its place; "
-            "python -m atlantis_exp baseline with the same env measures one."
+            f"{PROGRAM} baseline with the same env measures one."
         )
     scores = [row["score"] for row in facts.tables["scores"]]
     is_early = facts.frames <= facts_of(facts.game).early_frames

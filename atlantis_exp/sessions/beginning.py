@@ -4,6 +4,7 @@ from pathlib import Path
 
 from atlantis_exp.components import ENTRY_POINTS
 from atlantis_exp.faults import ConfigError
+from atlantis_exp.terminal import PROGRAM
 
 _MODEL = '''"""The network {name}."""
 
@@ -189,4 +190,4 @@ def begin(kind: str, name: str, folder: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text.format_map(words))
         print(path)
-    print(f"\npython -m atlantis_exp check {kind}={name} plugins={package / name}.py")
+    print(f"\n{PROGRAM} check {kind}={name} plugins={package / name}.py")

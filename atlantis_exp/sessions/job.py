@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from atlantis_exp.config import Config
+from atlantis_exp.terminal import PROGRAM
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def replaced(overrides: Iterable[str], *others: str) -> list[str]:
 
 def command_line(*arguments: str) -> str:
     """A command of ours as a shell takes it."""
-    return shlex.join(["python", "-m", "atlantis_exp", *arguments])
+    return " ".join((PROGRAM, *map(shlex.quote, arguments)))
 
 
 def config_colour(config: Config) -> str:

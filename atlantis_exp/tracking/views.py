@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from atlantis_exp.runs.journal import NOTE
+from atlantis_exp.terminal import PROGRAM
 
 _SECTIONS = {  # cards a row, and their height in pixels
     "evaluation": (2, 360),
@@ -51,7 +52,7 @@ _ABOUT = """\
 def how_to_open(outputs: Path) -> str:
     """Say what starts the UI on the store of an outputs folder."""
     shown = outputs.relative_to(Path.cwd()) if outputs.is_relative_to(Path.cwd()) else outputs
-    return f"the MLflow UI: make ui, or python -m atlantis_exp ui paths.outputs={shown}"
+    return f"the MLflow UI: {PROGRAM} ui paths.outputs={shown}"
 
 
 def experiment_tags(newest: str | None) -> dict[str, str]:

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from atlantis_exp.faults import Fault
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.launchers import as_one_line
+from atlantis_exp.terminal import PROGRAM
 
 _LOOK_SECONDS = 5.0  # between two questions to Slurm
 
@@ -36,7 +37,7 @@ def all_awaited() -> Iterator[None]:
         lines = str(error).splitlines()  # behind the first two comes all that the job has printed
         raise Fault(" ".join(lines[:2]) if type(error) is UncompletedJobError else lines[-1]) from error
     except (KeyboardInterrupt, SystemExit) as left:
-        print("atlantis_exp: the jobs go on; python -m atlantis_exp sync publishes what they do", file=sys.stderr)
+        print(f"atlantis_exp: the jobs go on; {PROGRAM} sync publishes what they do", file=sys.stderr)
         sys.exit(getattr(left, "code", 128 + signal.SIGINT))
 
 
