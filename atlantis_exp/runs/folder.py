@@ -30,7 +30,8 @@ NETWORK = "network"
 """The name of the models that are a training's networks."""
 EVALUATION, EVALUATION_REPORT = "evaluation/episodes.csv", "evaluation/report.txt"  # of a run that is one evaluation
 
-_EVALUATED = {*(f"evaluation/{point}" for point in (*TABLE_COLUMNS, "episodes")), "actions/random_share"}
+EVALUATED = {*(f"evaluation/{point}" for point in (*TABLE_COLUMNS, "episodes")), "actions/random_share"}
+"""The metrics of an evaluation that tables show."""
 LOST = "lost"
 """The tag of a run that went on without a part of its replay memory: it is not the unbroken one bit for bit."""
 _HOLD_SECONDS = 2.0  # that a command waits for a run, which another may hold for a moment
@@ -55,7 +56,7 @@ class Result:
     report: str
 
     def __post_init__(self) -> None:
-        if self.evaluation and (missing := _EVALUATED - self.evaluation.keys()):
+        if self.evaluation and (missing := EVALUATED - self.evaluation.keys()):
             raise ValueError(f"its evaluation lacks {min(missing)}")
 
 
