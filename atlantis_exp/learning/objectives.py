@@ -66,7 +66,8 @@ class DoubleDQN(DQN):
     """
 
     def _next_values(self, s_tpm: torch.Tensor, online: QFunction, target: QFunction) -> torch.Tensor:
-        return taken(target(s_tpm), action_values(online(s_tpm)).argmax(1))
+        a_tpm = action_values(online(s_tpm)).argmax(1)
+        return taken(target(s_tpm), a_tpm)
 
 
 @component("quantile", "objective")
