@@ -18,13 +18,14 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
 
-from atlantis_exp import commands
+from atlantis_exp import commands, terminal
 from atlantis_exp.sessions.job import replaced
-from atlantis_exp.sessions.verifying import Session, fingerprints, run_and_kill, start
+from atlantis_exp.sessions.verifying import Session, fingerprints, generations, run_and_kill, start
 from benchmarks.composition import composed
 from benchmarks.contest import print_results, print_table
 
@@ -62,13 +63,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         console.print(f"some {options.kills * 5 / 60:,.0f} minutes on two cores; first each training unbroken")
         unbroken = {}
         for name in names:
-            _, unbroken[name] = _killed(name, Path(folder, name), 0)
+            with terminal.working(f"unbroken: {name}"):
+                _, unbroken[name] = _killed(name, Path(folder, name), 0)
             console.print(f"unbroken: {name}, {len(unbroken[name])} fingerprints")
         for copy, name in enumerate(itertools.cycle(names)):
             if (left := options.kills - sum(struck.values())) <= 0:
                 break
             place = Path(folder, f"{name}-{copy}")
-            kills, prints = _killed(name, place, min(left, _KILLS_OF_ONE.get(name, left)))
+            with terminal.working(f"copy {copy}: {name}", partial(_so_far, place)):
+                kills, prints = _killed(name, place, min(left, _KILLS_OF_ONE.get(name, left)))
             struck[name] += kills
             console.print(f"copy {copy}: {name}, killed {kills} times; {sum(struck.values()):,} of {options.kills:,}")
             parts = sorted({part for part, _ in prints.items() ^ unbroken[name].items()})
@@ -79,6 +82,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 shutil.rmtree(place)
     print_table("kills", ("training", "kills"), [(name, f"{kills:,}") for name, kills in struck.items()])
     print_results({"kills": sum(struck.values()), "differences": differences})
+
+
+def _so_far(outputs: Path) -> str:
+    return f"{generations(outputs, '*')} commits"
 
 
 def _killed(name: str, outputs: Path, kills: int) -> tuple[int, dict[str, str]]:

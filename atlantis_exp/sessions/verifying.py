@@ -110,11 +110,11 @@ def run_and_kill(start: Callable[[Path], Session], outputs: Path, runs: str, kil
     struck = 0
     outputs.mkdir(parents=True, exist_ok=True)
     while True:
-        before = _commits(outputs, runs)
+        before = generations(outputs, runs)
         session = start(outputs / _SAID)
         while struck < kills and session.poll() is None:
             time.sleep(0.01)
-            if _commits(outputs, runs) > before:
+            if generations(outputs, runs) > before:
                 time.sleep(random.random() * seconds)
                 with suppress(ProcessLookupError):  # it has just ended
                     os.killpg(session.pid, signal.SIGKILL)
@@ -143,7 +143,7 @@ def _last_line(path: Path) -> str:
     return next((line.strip() for line in reversed(lines) if line.strip()), "")
 
 
-def _commits(outputs: Path, runs: str) -> int:
+def generations(outputs: Path, runs: str) -> int:
     """The generations of all checkpoints of some runs so far."""
     newest: dict[Path, int] = {}
     for path in outputs.glob(f"runs/{runs}/checkpoints/0*/manifest.json"):
