@@ -287,6 +287,10 @@ class PhaseConfig:
     sampler: str
 
 
+PINNED = r"^[^\x00-\x1f]{1,1000}@[0-9a-f]{16}$"
+"""A folder of weights and what its file of weights has for a SHA-256."""
+
+
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class TrainingConfig:
     """When and on how much the learner learns."""
@@ -296,6 +300,15 @@ class TrainingConfig:
     batch_size: Annotated[int, Field(ge=1, le=2**24)]  # transitions
     precision: Literal["auto", "fp32", "bf16"]
     ema: Annotated[int, Field(ge=10)] | None = None  # updates over which evaluated weights are averaged; null: latest
+    weights: Annotated[str, Field(pattern=PINNED)] | None = None  # FOLDER@DIGEST of exported ones; null: random ones
+
+    @property
+    def pinned(self) -> tuple[str, str] | None:
+        """The folder of the weights to begin with, and sixteen hexadecimal digits of their SHA-256."""
+        if self.weights is None:
+            return None
+        folder, _, digits = self.weights.rpartition("@")
+        return folder, digits
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -457,8 +470,11 @@ class Config:
             del tree[key]
         del tree["env"]["workers"]
         tree["evaluation"]["video"] = bool(tree["evaluation"]["video"])  # what is filmed of a game is no part of it
-        if tree["training"]["ema"] is None:  # a run from before there was the key stays itself
-            del tree["training"]["ema"]
+        if self.training.pinned is not None:
+            _, tree["training"]["weights"] = self.training.pinned  # wherever they lie
+        for key in ("ema", "weights"):
+            if tree["training"][key] is None:  # a run from before there was the key stays itself
+                del tree["training"][key]
         if not self.plugins:
             del tree["plugins"]
         # A list, since the order of phases counts and their names do not.

@@ -106,6 +106,7 @@ def another(key: str, value: Any) -> Any:
         "optimizer.name": ("adam", "adamw"),
         "training.precision": ("fp32", "bf16"),
         "training.ema": (100, 200),
+        "training.weights": (f"a@{16 * '0'}",),
         "evaluation.video": (False,) if value else ("first_minute",),
         "env.max_pool": (False,) if value else (True,),
         "env.crop": ([0, 160, 210, 0], [16, 160, 96, 0]),
@@ -205,6 +206,19 @@ def test_an_address_that_is_none_or_holds_a_password_is_refused_without_repeatin
     with pytest.raises(ConfigError, match=r"tracking\.uri: .*MLFLOW_TRACKING_USERNAME") as refused:
         parse(Config, changed(TREES["cnn"], "tracking.uri", uri))
     assert "secret" not in str(refused.value)
+
+
+def test_the_identity_takes_what_weights_are_and_not_where_they_lie() -> None:
+    def identity(weights: str) -> str:
+        return parse(Config, changed(TREES["cnn"], "training.weights", weights)).identity()
+
+    assert identity(f"a@{16 * '0'}") == identity(f"../b@c@{16 * '0'}") != identity(f"a@{16 * '1'}")
+
+
+@pytest.mark.parametrize("weights", ["a", "@", f"@{16 * '0'}", f"a@{15 * '0'}g", f"a\n@{16 * '0'}", ""])
+def test_weights_without_their_digest_are_refused(weights: str) -> None:
+    with pytest.raises(ConfigError, match=r"training\.weights="):
+        parse(Config, changed(TREES["cnn"], "training.weights", weights))
 
 
 def test_a_run_from_before_a_key_stays_itself() -> None:

@@ -1,5 +1,7 @@
 """The config groups composed into a checked config; Hydra's compose API and OmegaConf are here and in `app` alone."""
 
+import hashlib
+import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,10 +20,11 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from atlantis_exp import components
-from atlantis_exp.checking import parse
+from atlantis_exp.checking import nearest, parse
 from atlantis_exp.commands import CHECKOUT, CONF
-from atlantis_exp.config import record_plugins
+from atlantis_exp.config import PINNED, record_plugins
 from atlantis_exp.faults import ConfigError
+from atlantis_exp.runs.files import ARTIFACT, read_file
 
 T = TypeVar("T")
 
@@ -58,10 +61,32 @@ def checked(schema: type[T], composed: DictConfig) -> T:
     tree = {str(key): value for key, value in composition.items() if key != "plugins"}
     if "plugins" in {each.name for each in fields(cast(Any, schema))}:
         record_plugins(tree)
+    training = tree.get("training")
+    if isinstance(training, dict) and isinstance(training.get("weights"), str):
+        training["weights"] = pinned(training["weights"])
     paths = tree.get("paths")
     if isinstance(paths, dict) and isinstance(paths.get("outputs"), str) and paths["outputs"]:
         paths["outputs"] = str(Path(paths["outputs"]).expanduser().absolute())
     return parse(schema, tree)
+
+
+def pinned(weights: str) -> str:
+    """A folder of exported weights as FOLDER@DIGEST, where a run's identity takes the digest from. Raises: ConfigError.
+
+    Who types a digest asks for no other weights.
+    """
+    folder, digits = weights.rpartition("@")[::2] if re.match(PINNED, weights) else (weights, "")
+    path = Path(folder) / "weights.safetensors"
+    try:
+        found = hashlib.sha256(read_file(path.resolve(), ARTIFACT)).hexdigest()[:16]
+    except (OSError, ValueError):
+        others = [str(other.parent) for other in Path(folder).parent.glob("*/weights.safetensors")]
+        raise ConfigError(
+            f"training.weights={folder}: no folder of exported weights; {nearest(folder, others)}"
+        ) from None
+    if digits not in ("", found):
+        raise ConfigError(f"training.weights={weights}: the weights there are @{found}")
+    return f"{folder}@{found}"
 
 
 def admit(plugins: Any) -> None:

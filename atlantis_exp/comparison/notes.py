@@ -169,6 +169,13 @@ def mixed(facts: Facts) -> Iterator[str]:
         yield f"The groups also differ in {_values(between)}."
 
 
+def begun(facts: Facts) -> Iterator[str]:
+    """Trainings before those that are compared."""
+    for label, runs in facts.groups.items():
+        if weights := dict.fromkeys(str(run.config[key]) for run in runs if run.config.get(key := "training.weights")):
+            yield f"{label} began with {_listed([*weights])}; what that took counts in no frames, hours or arithmetic."
+
+
 def survival_and_rate(facts: Facts) -> Iterator[str]:
     """Which part of the difference between two means is survival, and which is rate."""
     if len(facts.tables["why"]) != 2:
@@ -245,6 +252,7 @@ BESIDE: Sequence[Callable[[Facts], Iterator[str]]] = (
 NOTES: Sequence[Callable[[Facts], Iterator[str]]] = (
     few_seeds,
     mixed,
+    begun,
     survival_and_rate,
     missing_views,
     capped,

@@ -1,7 +1,7 @@
 """The learner: two networks, an optimizer, and the update that moves them."""
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, Literal
@@ -80,6 +80,13 @@ class Learner(ActionValues):
         self._sums = torch.zeros(len(_MEASURES), device=self.device)
         self._measured = 0  # updates in the sums
         self._first_nonfinite = torch.full((), -1, device=self.device)
+
+    def begin_with(self, weights: Mapping[str, torch.Tensor]) -> None:
+        """Take over a network's weights before the first update, in all networks. Raises: RuntimeError."""
+        for network in {id(each): each for each in (self.network, self.target, self.evaluated)}.values():
+            network.load_state_dict(weights)
+        for replicas in (self._online, self._target, self._evaluated):
+            replicas.refresh()
 
     def update(
         self,

@@ -104,6 +104,7 @@ def pack(weights: bytes) -> tuple[bytes, Literal["float32", "float16"]]:
 
 def portable(config: Config) -> Config:
     """A config without what is its machine's alone: processes, devices, places and servers."""
+    begun = config.training.pinned
     return replace(
         config,
         resume="auto",
@@ -111,6 +112,7 @@ def portable(config: Config) -> Config:
         threads=None,
         compile=False,
         env=replace(config.env, workers=None),
+        training=replace(config.training, weights=begun and f"{Path(begun[0]).name}@{begun[1]}"),
         tracking=replace(config.tracking, uri=None),
         paths=PathsConfig(outputs="outputs"),
     )

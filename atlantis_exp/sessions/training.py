@@ -3,20 +3,22 @@
 import dataclasses
 import signal
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from functools import partial
+from pathlib import Path
 
 import torch
 
 from atlantis_exp import terminal
-from atlantis_exp.build import build_trainer, choose_device, described, import_components
+from atlantis_exp.build import build_trained_network, build_trainer, choose_device, described, import_components
 from atlantis_exp.checking import flatten, to_dict
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault, RunFault
 from atlantis_exp.runs.folder import CONFIG, LOST, TRACEBACK, Result, RunFolder, all_runs
 from atlantis_exp.runs.journal import Journal, adopt
 from atlantis_exp.runs.provenance import provenance
+from atlantis_exp.sessions.cards import read_card
 from atlantis_exp.sessions.job import Job, labels
 from atlantis_exp.sessions.stopping import StopRequest, sweep_goes_on
 from atlantis_exp.tracking.publishing import catch_up, publishing
@@ -39,6 +41,8 @@ def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int |
     if folder.status != "SCHEDULED":  # where a sweep has, its failure is to be recorded
         choose_device(config.device)  # before anything is put aside or written
         import_components(config)
+        if not folder.has_started:
+            _initial_weights(config)
     if _has_ended(job, folder):
         return None
     progress = Progress()
@@ -93,6 +97,26 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
     return True
 
 
+def _initial_weights(config: Config) -> Mapping[str, torch.Tensor] | None:
+    """The exported weights that a training begins with; None where it begins with random ones.
+
+    Raises:
+        ConfigError: where there are none, others than there were, or another network's.
+        Fault: where they are damaged.
+    """
+    if config.training.pinned is None:
+        return None
+    folder, digits = config.training.pinned
+    card, content = read_card(Path(folder))
+    if not card.sha256.startswith(digits):
+        raise ConfigError(f"training.weights={config.training.weights}: the weights there are @{card.sha256[:16]}")
+    try:
+        return build_trained_network(config, content).state_dict()
+    except Fault:
+        theirs = f"model={card.config.model.name}, env.size={card.config.env.size}, {card.config.objective.name}"
+        raise ConfigError(f"training.weights={folder}: another network's ({theirs})") from None
+
+
 def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progress: Progress) -> None:
     """Bring a trainer to its run's last commit, and write down what the run is."""
     config = job.config
@@ -102,6 +126,8 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
     with unforged(folder.checkpoints):
         steps_done = 0 if state is None else int(state["counters"]["steps"])
     if state is None:
+        if (weights := _initial_weights(config)) is not None:
+            trainer.learner.begin_with(weights)
         progress.say(f"starting run {folder.name} in {folder.path}{_changed_plugins(config, folder)}")
     else:
         progress.say(f"continuing run {folder.name} at step {steps_done:,}")

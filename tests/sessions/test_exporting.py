@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,11 +15,13 @@ from atlantis_exp.comparison.gather import gather, group, plays_alike
 from atlantis_exp.comparison.tables import compare
 from atlantis_exp.comparison.verdict import Question
 from atlantis_exp.config import Config
+from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.sessions import cards, onnx
 from atlantis_exp.sessions.cards import build_exported_actor, read_card
-from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.training import train
 from atlantis_exp.training.actor import EpsilonGreedy
+from atlantis_exp.training.trainer import Trainer
 
 Command = Callable[..., int]
 Compose = Callable[..., Config]
@@ -30,6 +33,83 @@ def trained(tiny: Compose) -> Path:
     config = tiny("env.max_steps=200")
     train(Job(config))
     return Path(config.paths.outputs)
+
+
+@pytest.fixture
+def exported(command: Command, trained: Path, tmp_path: Path) -> Path:
+    """The folder of an exported network."""
+    folder = tmp_path / "pretrained" / "tiny"
+    assert command("export", f"to={folder}", "episodes=1", f"paths.outputs={trained}", "device=cpu") == 0
+    return folder
+
+
+def test_a_training_begins_with_exported_weights_also_where_it_was_killed_before_its_first_commit(
+    tiny: Compose, exported: Path, tmp_path: Path
+) -> None:
+    config = tiny("seed=1", "training.ema=10", f"training.weights={exported}", f"paths.outputs={tmp_path / 'second'}")
+    RunFolder.of(config).path.mkdir(parents=True)
+    RunFolder.of(config).write_config({})  # as a kill leaves it
+    _, content = read_card(exported)
+    expected = safetensors.numpy.load(content)
+    looks = []
+
+    def watch(trainer: Trainer) -> bool:
+        if trainer.learner.updates == 0:
+            for network in (trainer.learner.network, trainer.learner.target, trainer.learner.evaluated):
+                made = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
+                assert made.keys() == expected.keys()
+                assert all((made[name] == expected[name].astype(np.float32)).all() for name in expected)
+        looks.append(trainer.counters.steps)
+        return len(looks) == 9
+
+    train(Job(config), watch)
+    shutil.rmtree(exported)  # a run that has a commit is its own
+    train(Job(config), watch)
+    assert [*dict.fromkeys(looks)] == [*range(161)]  # in evaluations, too
+    assert RunFolder.of(config).state == "done"
+
+
+def test_an_export_of_what_began_with_weights_says_which_and_not_where(
+    command: Command, tiny: Compose, exported: Path, tmp_path: Path
+) -> None:
+    config = tiny("seed=1", f"training.weights={exported}", f"paths.outputs={tmp_path / 'second'}")
+    train(Job(config))
+    folder = tmp_path / "again"
+    assert command("export", f"to={folder}", "episodes=1", f"paths.outputs={tmp_path / 'second'}", "device=cpu") == 0
+    first, _ = read_card(exported)
+    second, _ = read_card(folder)
+    assert second.config.training.weights == f"tiny@{first.sha256[:16]}"
+    assert str(tmp_path) not in (folder / "card.json").read_text()
+    gathered = gather(tmp_path / "second")
+    notes = compare(gathered, group(gathered.trainings, ["model"]), Question(["model"])).notes
+    assert (
+        f"cnn began with {config.training.weights}; what that took counts in no frames, hours or arithmetic." in notes
+    )
+
+
+def test_weights_that_no_training_can_begin_with_are_one_line_and_leave_nothing(
+    command: Command,
+    tiny_overrides: tuple[str, ...],
+    exported: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def refused(*words: str) -> str:
+        assert command(*replaced(tiny_overrides, f"paths.outputs={tmp_path / 'second'}", *words)) == 2
+        assert not (tmp_path / "second").exists()
+        return capsys.readouterr().err.removeprefix(f"atlantis_exp: training.weights={exported}")
+
+    capsys.readouterr()
+    digest = read_card(exported)[0].sha256[:16]
+    assert refused(f"training.weights={exported}x") == (
+        f"x: no folder of exported weights; did you mean '{exported}'? (valid: {exported})\n"
+    )
+    assert refused(f"training.weights='{exported}@{16 * '0'}'") == f"@{16 * '0'}: the weights there are @{digest}\n"
+    theirs = ": another network's (model=cnn, env.size=40, dqn)\n"
+    assert refused(f"training.weights={exported}", "model=resnet_fast") == theirs
+    assert refused(f"training.weights='{exported}@{digest}'", "env.size=44") == theirs
+    (exported / "card.json").write_text("{}")
+    assert "card.json" in refused(f"training.weights={exported}")
 
 
 def test_exported_weights_score_what_their_card_says(
