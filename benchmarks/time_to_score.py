@@ -67,10 +67,10 @@ class Judge:
 
 
 @contextmanager
-def ours(judge: Judge, *overrides: str) -> Iterator[Measure[Turn]]:
+def ours(judge: Judge) -> Iterator[Measure[Turn]]:
     """Our recipe."""
     quiet = ("evaluation.at_end=false", "evaluation.every_steps=null", "evaluation.video=false")
-    config = composed("experiment=fast", *quiet, *overrides)
+    config = composed("experiment=fast", *quiet)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         trainer = build_trainer(config, Path(folder), NullJournal(), _QUIET)
         stack.callback(trainer.emulators.close)
@@ -96,19 +96,13 @@ def stable_baselines3(judge: Judge, make: Callable[[Any], Any]) -> Iterator[Meas
     model = make(env)
     config = composed("env=atlantis_standard", "env.sticky=0", "env.noop_max=30")  # as AtariWrapper plays
 
+    network = model.quantile_net if hasattr(model, "quantile_net") else model.q_net
+
     def q_values(states: States) -> npt.NDArray[np.float32]:
         with torch.no_grad():
-            q = model.q_net(torch.from_numpy(states))  # scales bytes itself
-        values: npt.NDArray[np.float32] = q.numpy()
+            q = network(torch.from_numpy(states))  # scales bytes itself; (B, A), or quantiles (B, N, A)
+        values: npt.NDArray[np.float32] = (q if q.ndim == 2 else q.mean(1)).numpy()
         return values
-
-    def quantile_values(states: States) -> npt.NDArray[np.float32]:
-        with torch.no_grad():
-            z = model.quantile_net(torch.from_numpy(states))  # (B, N, A)
-        values: npt.NDArray[np.float32] = z.mean(1).numpy()
-        return values
-
-    values = quantile_values if hasattr(model, "quantile_net") else q_values
 
     def measure(seconds: float) -> Turn:
         began = time.perf_counter()
@@ -120,7 +114,7 @@ def stable_baselines3(judge: Judge, make: Callable[[Any], Any]) -> Iterator[Meas
         )
         hours = (time.perf_counter() - began) / 3600
         model.policy.set_training_mode(False)
-        return Turn(hours, model.num_timesteps, judge(config, values))
+        return Turn(hours, model.num_timesteps, judge(config, q_values))
 
     try:
         yield measure

@@ -1,7 +1,11 @@
 """What a person sees of work that takes long."""
 
 import io
+import shutil
+import subprocess
+import sys
 import threading
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -57,3 +61,19 @@ def test_an_error_ends_the_telling() -> None:
     with pytest.raises(ZeroDivisionError), terminal.working("failing"):
         _ = 1 / 0
     assert not [thread for thread in threading.enumerate() if thread.name == "telling"]
+
+
+@pytest.mark.parametrize(("brings", "program"), [((), "python -m atlantis_exp"), (("conf",), "atlantis-exp")])
+def test_a_person_calls_an_installed_wheel_by_its_command(
+    brings: tuple[str, ...], program: str, tmp_path: Path
+) -> None:
+    """A wheel is what brings the config groups in its package."""
+    package = tmp_path / "atlantis_exp"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    shutil.copy(terminal.__file__, package)
+    for name in brings:
+        (package / name).mkdir()
+    words = (sys.executable, "-c", "from atlantis_exp.terminal import PROGRAM; print(PROGRAM)")
+    said = subprocess.run(words, cwd=tmp_path, env={}, capture_output=True, text=True, check=True)
+    assert said.stdout == f"{program}\n"

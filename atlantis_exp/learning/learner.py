@@ -83,7 +83,7 @@ class Learner(ActionValues):
 
     def begin_with(self, weights: Mapping[str, torch.Tensor]) -> None:
         """Take over a network's weights before the first update, in all networks. Raises: RuntimeError."""
-        for network in {id(each): each for each in (self.network, self.target, self.evaluated)}.values():
+        for network in (self.network, self.target, self.evaluated):
             network.load_state_dict(weights)
         for replicas in (self._online, self._target, self._evaluated):
             replicas.refresh()

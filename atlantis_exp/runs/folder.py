@@ -13,7 +13,7 @@ from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.runs import lock
 from atlantis_exp.runs.files import SMALL, inside, read_file, schema_of, write_file
-from atlantis_exp.runs.journal import Commit, Status, read_commit
+from atlantis_exp.runs.journal import Commit, Record, Status, read, read_commit
 
 CONFIG, RESULT, COMMIT = "config.json", "result.json", "commit.json"
 TRACEBACK = "traceback.txt"
@@ -121,6 +121,14 @@ class RunFolder:
     def commit(self) -> Commit | None:
         """What the run's writer last committed, None before its first commit or status."""
         return read_commit(self.path)
+
+    def records(self) -> Iterator[Record]:
+        """What the run's journal holds, as of its last commit. Raises: Fault, where it is damaged."""
+        try:
+            for _, record in read(self.path):
+                yield record
+        except ValueError as error:
+            raise Fault(f"run {self.name}: {error}") from error
 
     @property
     def title(self) -> str:

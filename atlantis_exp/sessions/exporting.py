@@ -9,9 +9,9 @@ from typing import Literal
 from atlantis_exp import terminal
 from atlantis_exp.build import build_evaluator
 from atlantis_exp.config import EvaluationConfig, PathsConfig
-from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.folder import RunFolder, find_run
-from atlantis_exp.runs.journal import Metrics, Tags, read
+from atlantis_exp.runs.journal import Metrics, Tags
 from atlantis_exp.sessions.cards import Card, build_exported_actor, pack, portable, write_card
 from atlantis_exp.sessions.weights import stored_weights
 from atlantis_exp.tracking.publishing import catch_up
@@ -76,11 +76,7 @@ def _history(run: RunFolder, step: int) -> tuple[dict[str, float], dict[str, str
     """What a training had behind it at a step, and what made it. Raises: Fault, where its journal is damaged."""
     reached: dict[str, float] = {}
     tags: dict[str, str] = {}
-    try:
-        records = [record for _, record in read(run.path)]
-    except ValueError as error:
-        raise Fault(f"run {run.name}: {error}") from error
-    for record in records:
+    for record in run.records():
         if isinstance(record, Tags):
             tags |= record.values
         elif isinstance(record, Metrics) and "throughput/frames" in record.values and record.step <= step:

@@ -7,10 +7,9 @@ from rich.table import Table
 
 from atlantis_exp import terminal
 from atlantis_exp.config import PathsConfig
-from atlantis_exp.faults import Fault
 from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.runs.folder import EVALUATED, RunFolder, all_runs
-from atlantis_exp.runs.journal import Metrics, read
+from atlantis_exp.runs.journal import Metrics
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.tracking.views import how_to_open
 
@@ -28,34 +27,31 @@ def report(*, paths: PathsConfig) -> None:
     table = Table(*columns, title=f"last evaluations of the runs in {shown}")
     for column in table.columns[1:]:
         column.justify = "right"
-    for run in runs:
+    results = [run.result for run in runs]
+    for run, result in zip(runs, results, strict=True):
+        if result is not None:
+            table.add_row(run.name, f"{result.steps:,}", *_cells(result.evaluation))
+            continue
         step, evaluation = _last_evaluation(run)
-        reached = f"{step:,}" if run.result is not None else f"{step:,} ({run.state})" if evaluation else run.state
-        table.add_row(run.name, reached, *_cells(evaluation))
+        table.add_row(run.name, f"{step:,} ({run.state})" if evaluation else run.state, *_cells(evaluation))
     console = terminal.console(least=150)
     console.print(table)
-    for run in runs:
-        if run.result is not None:
-            console.print(f"\n{run.name}\n{run.result.report}")
+    for run, result in zip(runs, results, strict=True):
+        if result is not None:
+            console.print(f"\n{run.name}\n{result.report}")
     console.print(f"\n{how_to_open(outputs)}")
 
 
 def _last_evaluation(run: RunFolder) -> tuple[int, Mapping[str, float]]:
-    """At which step a run was evaluated last, and its metrics; none where there was no evaluation yet.
+    """At which step a run that goes on was evaluated last, and its metrics; none where there was no evaluation yet.
 
     Raises: Fault, where its journal is damaged.
     """
-    if (result := run.result) is not None:
-        return result.steps, result.evaluation
-    try:
-        evaluations = [
-            (record.step, record.values)
-            for _, record in read(run.path)
-            if isinstance(record, Metrics) and record.values.keys() >= EVALUATED
-        ]
-    except ValueError as error:
-        raise Fault(f"run {run.name}: {error}") from error
-    return evaluations[-1] if evaluations else (0, {})
+    found: tuple[int, Mapping[str, float]] = (0, {})
+    for record in run.records():
+        if isinstance(record, Metrics) and record.values.keys() >= EVALUATED:
+            found = record.step, record.values
+    return found
 
 
 def _cells(evaluation: Mapping[str, float]) -> list[str]:

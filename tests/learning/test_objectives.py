@@ -135,12 +135,7 @@ def test_rescaled_targets_are_of_returns_and_of_the_action_with_the_best_rescale
 
 @pytest.mark.parametrize(
     ("objective", "shape"),
-    [
-        (DQN(), (2, 4)),
-        (DoubleDQN(), (2, 4)),
-        (Quantile(5), (2, 4, 3)),
-        (DoubleQuantile(5), (2, 4, 3)),
-    ],
+    [(DQN(), (2, 4)), (DoubleDQN(), (2, 4)), (Quantile(5), (2, 4, 3)), (DoubleQuantile(5), (2, 4, 3))],
     ids=str,
 )
 def test_nothing_comes_through_a_cut_bootstrap(objective: DQN | Quantile, shape: tuple[int, ...]) -> None:
@@ -148,6 +143,16 @@ def test_nothing_comes_through_a_cut_bootstrap(objective: DQN | Quantile, shape:
     targets = objective.targets(torch.tensor([1.0, 2.0]), wild, torch.tensor([0.0, 0.9]), lambda s: s, lambda s: -s)
     assert (targets[0] == 1.0).all()
     assert (targets[1] == -torch.inf).all()
+
+
+@pytest.mark.parametrize("rescaling", WRITTEN_OUT)
+def test_nothing_comes_through_a_cut_bootstrap_of_rescaled_returns(rescaling: Literal["signed_sqrt", "symlog"]) -> None:
+    wild = torch.full((2, 4), torch.inf)
+    targets = RescaledDoubleDQN(rescaling).targets(
+        torch.tensor([1.0, 2.0]), wild, torch.tensor([0.0, 0.9]), lambda s: s, lambda s: -s
+    )
+    assert targets[0].item() == pytest.approx(WRITTEN_OUT[rescaling][0](1.0))
+    assert not targets[1].isfinite()  # which ends a training
 
 
 @every_seed
