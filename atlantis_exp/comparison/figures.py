@@ -131,9 +131,9 @@ def _render(plot: Callable[["Axes"], None], title: str, alt: str, height: float 
 
         figure = Figure(figsize=(4.8, height), layout="constrained")
         plot(figure.add_subplot())
-        figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # the layout is found: each picture would find it twice again
-        return Drawn(title, alt, _png(figure), _svg(figure, alt))
+        png = _png(figure)
+        figure.set_layout_engine("none")  # the layout is found, once for both pictures
+        return Drawn(title, alt, png, _svg(figure, alt))
 
 
 @contextmanager
@@ -145,14 +145,23 @@ def _style() -> Iterator[None]:
 
 
 def _png(figure: "Figure") -> bytes:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=150, facecolor="white")
+    figure.set_dpi(150)
+    figure.set_facecolor("white")
+    # `savefig` would draw twice, the first time for the layout alone.
+    FigureCanvasAgg(figure).print_png(buffer)  # type: ignore[no-untyped-call]
     return buffer.getvalue()
 
 
 def _svg(figure: "Figure", alt: str) -> str:
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    for patch in (figure.patch, *(axes.patch for axes in figure.axes)):
+        patch.set_visible(False)  # the page is the ground
+    FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})  # type: ignore[no-untyped-call]
     svg = buffer.getvalue()[buffer.getvalue().index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     svg = re.sub(r' id="[a-z]+[a-z0-9]*_[0-9]+"', "", svg)  # groups; what is referred to is named by a hash
@@ -172,9 +181,19 @@ def _look(groups: Sequence[str], group: str) -> dict[str, Any]:
 
 
 def _thousands(axis: Any) -> None:
-    from matplotlib.ticker import EngFormatter
+    from matplotlib.ticker import EngFormatter, LogFormatter
 
-    axis.set_major_formatter(EngFormatter(sep=""))
+    written = EngFormatter(sep="")
+    axis.set_major_formatter(written)
+    if axis.get_scale() == "log":
+
+        class Between(LogFormatter):
+            """Numbers at those ticks between powers of ten where a logarithmic axis has room for them."""
+
+            def __call__(self, x: float, pos: int | None = None) -> str:
+                return written(x) if super().__call__(x, pos) else ""
+
+        axis.set_minor_formatter(Between())
 
 
 def _legend(axes: "Axes", columns: int = 2) -> None:

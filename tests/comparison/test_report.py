@@ -128,6 +128,14 @@ def test_few_episodes_are_dots_and_many_a_histogram(recorded: Recorded, tmp_path
     assert many.alt.startswith("Histogram")
 
 
+def test_scores_within_a_decade_are_marked_in_thousands(recorded: Recorded, tmp_path: Path) -> None:
+    recorded(scores=(2_100.0, 5_200.0))
+    gathered = gather(tmp_path)
+    svg = draw(compare(gathered, group(gathered.trainings, ["model"]), Question(["model"])))["profile"].svg
+    assert "mathdefault" not in svg
+    assert {">3k<", ">4k<"} <= set(re.findall(r">[0-9.]+k<", svg))
+
+
 @pytest.mark.slow
 def test_two_bands_at_most_lie_over_each_other(recorded: Recorded, tmp_path: Path) -> None:
     for index, model in enumerate(("cnn", "resnet", "resnet_fast")):
