@@ -324,8 +324,9 @@ def build_baseline(agent: cfg.BaselineAgentConfig, env: cfg.EnvConfig) -> Actor:
 
 def build_evaluator(env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig) -> Evaluator:
     """What evaluates any actor by this protocol."""
+    workers = env.workers or max(1, _cores() - 1)  # the network's decisions, made meanwhile, take a core
     return Evaluator(
-        make_emulators=partial(build_emulators, env),
+        make_emulators=partial(build_emulators, dataclasses.replace(env, workers=workers)),
         make_emulator=make_emulator(env),
         epsilon=evaluation.epsilon,
         seed=evaluation.seed,

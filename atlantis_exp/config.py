@@ -60,7 +60,7 @@ class EnvConfig:
     size: Size  # pixels
     stack: Annotated[int, Field(ge=1, le=8)]  # observations
     num_envs: Annotated[int, Field(ge=1, le=64)]
-    workers: Annotated[int, Field(ge=1, le=64)] | None  # processes; null: one a core
+    workers: Annotated[int, Field(ge=1, le=64)] | None  # processes; null: one a core, in evaluations one fewer
 
     def __post_init__(self) -> None:
         rows, columns = SCREEN

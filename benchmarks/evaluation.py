@@ -35,7 +35,7 @@ from benchmarks.contest import Contestant, Measure, calls_per_second, print_rate
 Program = Callable[[str, int], AbstractContextManager[Measure[float]]]  # of a folder of weights and a number of games
 
 _CORES = len(os.sched_getaffinity(0))
-_WARM_STEPS = 20  # of all games
+_WARM_STEPS = 40  # of half the games
 _QUIET = Progress(Console(quiet=True))
 
 
@@ -61,7 +61,8 @@ def evaluating(folder: str, num_envs: int) -> Iterator[Measure[float]]:
 
         with suppress(Stopped):
             evaluator(actor, num_envs, _QUIET, stop)
-        return num_envs * (len(marks) - 1 - _WARM_STEPS) / (marks[-1] - marks[_WARM_STEPS])
+        steps = num_envs / min(2, num_envs) * (len(marks) - 1 - _WARM_STEPS)
+        return steps / (marks[-1] - marks[_WARM_STEPS])
 
     yield measure
 

@@ -1,7 +1,7 @@
-"""Draw `docs/images/fast.png` from `docs/data/fast.csv`: scores of docs/results.md by steps and by hours.
+"""Draw `docs/images/NAME.png` from `docs/data/NAME.csv`: scores of docs/results.md by steps and by hours.
 
-`python docs/make_results_picture.py [OUTPUTS...]`, from the root of the checkout. The trainings in the folders OUTPUTS
-enter the table first, in the place of what it has of runs of the same names.
+`python docs/make_results_picture.py fast|answer [OUTPUTS...]`, from the root of the checkout. The trainings in the
+folders OUTPUTS enter the table first, in the place of what it has of runs of the same names.
 """
 
 import sys
@@ -16,7 +16,6 @@ from atlantis_exp.media import BLUE, GREEN, GREY, VERMILLION
 from atlantis_exp.runs.folder import RunFolder, all_runs
 from atlantis_exp.runs.journal import Metrics, read, read_commit
 
-TABLE = Path("docs/data/fast.csv")
 KEYS = {
     "hours": "throughput/hours",
     "updates": "learning/updates",
@@ -25,30 +24,33 @@ KEYS = {
 }
 EVALUATION = "evaluation/mean"
 COLUMNS = ("run", "step", *KEYS, "evaluation")
+COLOURS = {"cnn": VERMILLION, "resnet_fast": BLUE, "resnet": GREEN}
 EVERY = 10_000  # steps between two rows of the table; evaluations have rows of their own
 
 
-def main(outputs: Sequence[Path]) -> None:
-    """Bring the table up to date and draw a line a run, with a point for each evaluation."""
+def main(name: str, outputs: Sequence[Path]) -> None:
+    """Bring the table up to date and draw a line a run, in its network's colour, with a point for each evaluation."""
     runs = [run for folder in outputs for run in all_runs(folder)]
     new = (dict(zip(COLUMNS, row, strict=True)) for run in runs for row in rows_of(run))
-    rows = updated(TABLE, COLUMNS, {run.name for run in runs}, new, lambda row: (row["run"],))
+    table = Path(f"docs/data/{name}.csv")
+    rows = updated(table, COLUMNS, {run.name for run in runs}, new, lambda row: (row["run"],))
 
     figure = Figure(figsize=(11, 4.5), dpi=100, layout="constrained")
     by_steps, by_hours = figure.subplots(1, 2, sharey=True)
-    lines = groupby(rows, key=lambda row: row["run"])
-    for colour, (name, points) in zip(cycle((VERMILLION, BLUE, GREEN)), lines, strict=False):
-        of_run = list(points)
+    styles = {model: cycle(("-", "--", "-.", ":", (0, (1, 3)))) for model in COLOURS}
+    for run, points in groupby(rows, key=lambda row: row["run"]):
+        of_run, model = list(points), run.partition("-")[0]
+        style, colour = next(styles[model]), COLOURS[model]
         evaluated = [row for row in of_run if row["evaluation"]]
         for axes, key, unit in ((by_steps, "step", 1e6), (by_hours, "hours", 1)):
-            axes.plot(*columns(of_run, key, "mean_20", unit), color=colour, label=name, linewidth=1)
+            axes.plot(*columns(of_run, key, "mean_20", unit), color=colour, linestyle=style, label=run, linewidth=1)
             axes.plot(*columns(evaluated, key, "evaluation", unit), "o", color=colour)
     for axes in (by_steps, by_hours):
         axes.axhline(RANDOM, color=GREY, linestyle=":", linewidth=1)
     by_steps.set(yscale="log", xlabel="million steps", ylabel="score: mean of 20 in training, evaluations as points")
     by_steps.legend(frameon=False, fontsize="small")
     by_hours.set(xlabel="hours, whatever else the machine did")
-    figure.savefig("docs/images/fast.png")
+    figure.savefig(f"docs/images/{name}.png")
 
 
 def columns(rows: list[dict[str, str]], x: str, y: str, unit: float) -> tuple[list[float], list[float]]:
@@ -59,7 +61,8 @@ def columns(rows: list[dict[str, str]], x: str, y: str, unit: float) -> tuple[li
 def rows_of(run: RunFolder) -> Iterator[list[str]]:
     """The table's rows of a run, as far as it is committed."""
     commit = read_commit(run.path)
-    assert commit is not None
+    if commit is None:  # only begun
+        return
     latest: dict[str, float] = {}
     written = 0
     for _, record in read(run.path, 0, commit.offset):
@@ -74,4 +77,4 @@ def rows_of(run: RunFolder) -> Iterator[list[str]]:
 
 
 if __name__ == "__main__":
-    main([Path(argument) for argument in sys.argv[1:]])
+    main(sys.argv[1], [Path(argument) for argument in sys.argv[2:]])

@@ -17,7 +17,8 @@ def updated(
     key: Callable[[Row], tuple[str, ...]],
 ) -> list[Row]:
     """A table's rows by `key`, once `rows` have taken the place of what it had of the runs of these names."""
-    kept = [row for row in csv.DictReader(table.read_text().splitlines()) if row["run"] not in runs]
+    known = table.read_text().splitlines() if table.exists() else []
+    kept = [row for row in csv.DictReader(known) if row["run"] not in runs]
     merged = sorted([*kept, *rows], key=key)
     with table.open("w") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from atlantis_exp.build import build_emulators, build_learner
+from atlantis_exp.build import build_emulators, build_evaluator, build_learner
 from atlantis_exp.config import Config
 from atlantis_exp.game.vector import ProcessEmulators
 
@@ -57,3 +57,14 @@ def test_emulators_share_the_cores_where_the_system_does_not_say_which_are_ours(
         assert isinstance(emulators, ProcessEmulators)
         assert len(emulators._processes) == 2
         emulators.reset(range(3), [0, 1, 2])
+
+
+@pytest.mark.parametrize(("asked", "cores", "workers"), [("null", 4, 3), ("null", 2, 1), ("null", 1, 1), ("2", 2, 2)])
+def test_an_evaluation_leaves_a_core_to_the_network(
+    tiny: Callable[..., Config], monkeypatch: pytest.MonkeyPatch, asked: str, cores: int, workers: int
+) -> None:
+    monkeypatch.setattr("atlantis_exp.build._cores", lambda: cores)
+    config = tiny("evaluation.num_envs=4", f"env.workers={asked}")
+    with build_evaluator(config.env, config.evaluation).make_emulators(4) as emulators:
+        assert isinstance(emulators, ProcessEmulators)
+        assert len(emulators._processes) == workers

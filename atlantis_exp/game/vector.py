@@ -1,10 +1,11 @@
-"""Many emulators in lock-step, here or in worker processes; neither their number nor timing changes a result."""
+"""Many emulators, here or in worker processes; neither the number of these nor timing changes a result."""
 
 import atexit
 import multiprocessing
 import os
 import signal
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from ctypes import Array, c_ubyte
@@ -46,47 +47,50 @@ class Steps(NamedTuple):
 class Emulators(ABC):
     """Emulators of environments 0 to num_envs - 1, all of one game; none begins an episode by itself.
 
-    `envs` are distinct, by default all. Raises RuntimeError where anything but `receive` follows `send`.
+    `envs` are distinct, by default all. Several steps can be under way, of different environments each. Raises
+    RuntimeError where one is called whose step was sent and not received.
     """
 
     def __init__(self, num_envs: int, game: Game, rows: Rows) -> None:
         self.num_envs, self.game = num_envs, game
         self._rows = rows
-        self._sent: Envs | None = None
+        self._sent: deque[Envs] = deque()  # the environments of each step that was sent and not received
+        self._unheard = 0  # how many of these, the latest, were not waited for
 
     def reset(self, envs: Envs, seeds: Sequence[int | None] | None = None) -> Pixels:
         """Begins an episode in each of `envs` and returns the first observations, (len(envs), size, size)."""
         seeds = [None] * len(envs) if seeds is None else seeds
         self._call("reset", {int(env): (seed,) for env, seed in zip(envs, seeds, strict=True)})
-        self._results()
         return self._columns(envs).observations
 
     def send(self, actions: Sequence[int] | npt.NDArray[np.int64], envs: Envs | None = None) -> None:
         """Starts a step of `envs` with one action each."""
         envs = range(self.num_envs) if envs is None else envs
-        self._call("step", {int(env): (int(action),) for env, action in zip(envs, actions, strict=True)})
-        self._sent = envs
+        calls: Calls = {int(env): (int(action),) for env, action in zip(envs, actions, strict=True)}
+        self._refuse_sent(calls)
+        self._start("step", calls)
+        self._sent.append(envs)
+        self._unheard += 1
 
     def receive(self) -> Steps:
-        """Waits for the step that was sent and returns it."""
-        if self._sent is None:
+        """Waits for the first of the steps that were sent and returns it."""
+        if not self._sent:
             raise RuntimeError("no step was sent")
-        envs, self._sent = self._sent, None
-        self._results()
-        return self._columns(envs)
+        self._wait(unheard=len(self._sent) - 1)
+        return self._columns(self._sent.popleft())
 
     def step(self, actions: Sequence[int] | npt.NDArray[np.int64], envs: Envs | None = None) -> Steps:
-        """Plays a step of `envs` with one action each."""
+        """Plays a step of `envs` with one action each; none may be under way."""
+        self._refuse_sent(dict.fromkeys(range(self.num_envs), ()))
         self.send(actions, envs)
         return self.receive()
 
     def state_dict(self) -> dict[str, Any]:
-        self._call("state_dict", dict.fromkeys(range(self.num_envs), ()))
-        return {str(env): state for env, state in sorted(self._results().items())}
+        states = self._call("state_dict", dict.fromkeys(range(self.num_envs), ()))
+        return {str(env): state for env, state in sorted(states.items())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._call("load_state_dict", {env: (state[str(env)],) for env in range(self.num_envs)})
-        self._results()
 
     def __enter__(self) -> Self:
         return self
@@ -105,12 +109,22 @@ class Emulators(ABC):
 
     @abstractmethod
     def _results(self) -> dict[int, Any]:
-        """Waits for the calls that were started; what they return by environment, but for what went into the rows."""
+        """Waits for the first of the calls that were started; what it returns by environment, but for the rows."""
 
-    def _call(self, method: str, calls: Calls) -> None:
-        if self._sent is not None:
-            raise RuntimeError("a step was sent and not received")
+    def _call(self, method: str, calls: Calls) -> dict[int, Any]:
+        self._refuse_sent(calls)
+        self._wait(unheard=0)
         self._start(method, calls)
+        return self._results()
+
+    def _wait(self, unheard: int) -> None:
+        while self._unheard > unheard:
+            self._results()
+            self._unheard -= 1
+
+    def _refuse_sent(self, calls: Calls) -> None:
+        if any(int(env) in calls for envs in self._sent for env in envs):
+            raise RuntimeError("a step was sent and not received")
 
     def _columns(self, envs: Envs) -> Steps:
         return Steps(*(self._rows[name][np.asarray(envs, np.intp)] for name in Steps._fields))

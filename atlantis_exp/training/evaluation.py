@@ -1,6 +1,7 @@
 """Evaluation: episodes at a fixed epsilon, on their own emulators and random streams (report figure 3.3)."""
 
 from array import array
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,7 +14,7 @@ from atlantis_exp.game.vector import Emulators
 from atlantis_exp.registry import Game
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.statistics import Summary, summarize
-from atlantis_exp.training.actor import Actor
+from atlantis_exp.training.actor import Actor, Decisions
 
 _COLLAPSED = 0.99  # share of the network's decisions that are one action
 
@@ -197,11 +198,12 @@ def evaluate(
 ) -> Evaluation:
     """Play `episodes` episodes side by side; what each is like depends on `seed` and its own index alone.
 
-    size in pixels and stack in observations, as the actor's states want them. on_step is called with all episodes, and
-    how many of them are over, after every step of those that are played.
+    The environments are two halves: while one is emulated, the actor decides for the other. size in pixels and stack in
+    observations, as the actor's states want them. on_step is called with all episodes, and how many of them are over,
+    after every step of a half.
 
     Raises:
-        Stopped: when `stop`, which is asked before every step, says so.
+        Stopped: when `stop`, which is asked before every step is received, says so.
     """
     game = emulators.game
     played = [
@@ -212,6 +214,7 @@ def evaluate(
     stacks = FrameStack(emulators.num_envs, size, stack)
     waiting = iter(range(episodes))
     playing: dict[int, int] = {}  # environment to the episode it plays
+    under_way: deque[tuple[range, npt.NDArray[np.int64], Decisions]] = deque()  # each with the half that it is of
     over = 0  # episodes
 
     def begin(env: int) -> None:
@@ -222,14 +225,22 @@ def evaluate(
             playing[env] = index
             stacks.reset([env], emulators.reset([env], [played[index].seed]))
 
+    def decide(half: range) -> None:
+        envs = np.array([env for env in half if env in playing])
+        if len(envs):
+            decisions = actor.act(stacks.state[envs], epsilon, [streams[playing[env]] for env in envs])
+            emulators.send(decisions.actions, envs)
+            under_way.append((half, envs, decisions))
+
     for env in range(min(emulators.num_envs, episodes)):
         begin(env)
-    while playing:
+    for first in (0, 1):
+        decide(range(first, emulators.num_envs, 2))
+    while under_way:
         if stop():
             raise Stopped
-        envs = np.array(sorted(playing))
-        decisions = actor.act(stacks.state[envs], epsilon, [streams[playing[env]] for env in envs])
-        steps = emulators.step(decisions.actions, envs)
+        half, envs, decisions = under_way.popleft()
+        steps = emulators.receive()
         stacks.push(steps.observations, envs)
         for row, env in enumerate(envs.tolist()):
             episode = played[playing[env]]
@@ -249,6 +260,7 @@ def evaluate(
                 episode.truncated = bool(steps.truncated[row])
                 over += 1
                 begin(env)
+        decide(half)
         on_step(played, over)
     return Evaluation(epsilon, played, game)
 

@@ -130,11 +130,29 @@ def test_a_step_can_be_sent_and_received_later(emulators: Emulators) -> None:
     assert_equal(later, emulators.step([1, 2], [2, 0]))
 
 
+def test_steps_of_other_environments_can_be_under_way(emulators: Emulators) -> None:
+    state = emulators.state_dict()
+    emulators.send([1, 2], [2, 0])
+    emulators.send([3], [1])
+    first = emulators.receive()
+    begun = emulators.reset([2], [7])  # while the second step is under way
+    emulators.send([3], [0])
+    second, third = emulators.receive(), emulators.receive()
+    emulators.load_state_dict(state)
+    assert_equal(first, emulators.step([1, 2], [2, 0]))
+    assert_equal(second, emulators.step([3], [1]))
+    np.testing.assert_array_equal(begun, emulators.reset([2], [7]))
+    assert_equal(third, emulators.step([3], [0]))
+
+
 def test_calls_out_of_turn_are_refused(emulators: Emulators) -> None:
     with pytest.raises(RuntimeError, match="no step was sent"):
         emulators.receive()
     emulators.send([0] * NUM_ENVS)
-    for call in (emulators.state_dict, lambda: emulators.reset([0]), lambda: emulators.send([0], [0])):
+    for call in (
+        *(emulators.state_dict, lambda: emulators.reset([0])),
+        *(lambda: emulators.send([0], [0]), lambda: emulators.step([0], [0])),
+    ):
         with pytest.raises(RuntimeError, match="sent and not received"):
             call()
     emulators.receive()

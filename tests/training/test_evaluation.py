@@ -10,8 +10,8 @@ import pytest
 from atlantis_exp.build import build_learner, make_emulator
 from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.config import Config
-from atlantis_exp.game.vector import make_emulators
-from atlantis_exp.training.actor import Actor, EpsilonGreedy, RandomActor
+from atlantis_exp.game.vector import Emulators, make_emulators
+from atlantis_exp.training.actor import Actor, Decisions, EpsilonGreedy, Generators, RandomActor, States
 from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate
 
 Compose = Callable[..., Config]
@@ -57,10 +57,44 @@ def test_more_environments_than_episodes_play_each_episode_once(played: Callable
     told: list[tuple[list[int], int]] = []
     play = partial(played, on_step=lambda episodes, over: told.append(([each.steps for each in episodes], over)))
     assert len({episode.seed for episode in play(3, episodes=2).episodes}) == 2
-    assert told == [([step, step], 0 if step < 25 else 2) for step in range(1, 26)]
+    steps = [[step, step - behind] for step in range(1, 26) for behind in (1, 0)]
+    assert told == [(each, each.count(25)) for each in steps]
     told.clear()
     play(1, episodes=2)
     assert told == [([min(step, 25), max(step - 25, 0)], step // 25) for step in range(1, 51)]
+
+
+def test_the_actor_decides_for_one_half_while_the_other_is_emulated(
+    tiny: Compose, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tape: list[str] = []
+
+    class Watched(RandomActor):
+        def act(self, states: States, epsilon: float, generators: Generators) -> Decisions:
+            tape.append(f"decide {len(states)}")
+            return super().act(states, epsilon, generators)
+
+    def watch(emulators: Emulators, name: str) -> None:
+        called = getattr(emulators, name)
+
+        def watched(*given: object) -> object:
+            tape.append(name)
+            return called(*given)
+
+        monkeypatch.setattr(emulators, name, watched)
+
+    env = tiny("env.max_steps=3").env
+    with make_emulators(make_emulator(env), 5, workers=0) as emulators:
+        watch(emulators, "send")
+        watch(emulators, "receive")
+        evaluate(Watched(4), emulators, episodes=6, epsilon=0.5, seed=5, size=env.size, stack=env.stack)
+    next_of_three, next_of_two = ["receive", "decide 3", "send"], ["receive", "decide 2", "send"]
+    the_sixth_episode = ["receive", "decide 1", "send"]  # on environment 0, while the others have none left
+    assert tape == [
+        *("decide 3", "send", "decide 2", "send"),
+        *2 * (next_of_three + next_of_two),
+        *(the_sixth_episode + ["receive"] + 2 * the_sixth_episode + ["receive"]),
+    ]
 
 
 def test_the_actions_are_counted_by_who_chose_them() -> None:
