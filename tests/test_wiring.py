@@ -122,7 +122,7 @@ def described(config: Config, trainer: Trainer) -> dict[str, Any]:
     expected = BUILT["optimizer"][config.optimizer.name]
     sampler = plan.phases[0].sampler
     with torch.no_grad():
-        outputs = learner.network(torch.zeros(1, 4, config.env.size, config.env.size, dtype=learner.dtype)).numel()
+        outputs = learner.network(torch.zeros(1, 4, config.env.size, config.env.size)).numel()
     emulator = make_emulator(config.env).keywords
     return {
         "model": type(learner.network).__name__,
