@@ -82,10 +82,9 @@ def make_emulator(env: cfg.EnvConfig) -> partial[Emulator]:
     )
 
 
-def build_emulators(env: cfg.EnvConfig, num_envs: int) -> Emulators:
-    """`num_envs` emulators, one of them in this process, more in worker processes."""
-    workers = env.workers or _cores()
-    return make_emulators(make_emulator(env), num_envs, min(workers, num_envs))
+def build_emulators(env: cfg.EnvConfig, num_envs: int, *, spare: int = 0) -> Emulators:
+    """`num_envs` emulators, one of them in this process, more in worker processes, which leave `spare` cores idle."""
+    return make_emulators(make_emulator(env), num_envs, env.workers or max(1, _cores() - spare))
 
 
 def _cores() -> int:
@@ -324,9 +323,8 @@ def build_baseline(agent: cfg.BaselineAgentConfig, env: cfg.EnvConfig) -> Actor:
 
 def build_evaluator(env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig) -> Evaluator:
     """What evaluates any actor by this protocol."""
-    workers = env.workers or max(1, _cores() - 1)  # the network's decisions, made meanwhile, take a core
     return Evaluator(
-        make_emulators=partial(build_emulators, dataclasses.replace(env, workers=workers)),
+        make_emulators=partial(build_emulators, env, spare=1),  # for the network's decisions, made meanwhile
         make_emulator=make_emulator(env),
         epsilon=evaluation.epsilon,
         seed=evaluation.seed,

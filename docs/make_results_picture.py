@@ -5,14 +5,16 @@ folders OUTPUTS enter the table first, in the place of what it has of runs of th
 """
 
 import sys
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from itertools import cycle, groupby
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 from tables import RANDOM, updated
 
-from atlantis_exp.media import BLUE, GREEN, GREY, VERMILLION
+from atlantis_exp.media import GREY, run_colour
 from atlantis_exp.runs.folder import RunFolder, all_runs
 from atlantis_exp.runs.journal import Metrics, read, read_commit
 
@@ -24,12 +26,11 @@ KEYS = {
 }
 EVALUATION = "evaluation/mean"
 COLUMNS = ("run", "step", *KEYS, "evaluation")
-COLOURS = {"cnn": VERMILLION, "resnet_fast": BLUE, "resnet": GREEN}
 EVERY = 10_000  # steps between two rows of the table; evaluations have rows of their own
 
 
 def main(name: str, outputs: Sequence[Path]) -> None:
-    """Bring the table up to date and draw a line a run, in its network's colour, with a point for each evaluation."""
+    """Bring the table up to date and draw a line a run, in its colour everywhere, with a point for each evaluation."""
     runs = [run for folder in outputs for run in all_runs(folder)]
     new = (dict(zip(COLUMNS, row, strict=True)) for run in runs for row in rows_of(run))
     table = Path(f"docs/data/{name}.csv")
@@ -37,10 +38,11 @@ def main(name: str, outputs: Sequence[Path]) -> None:
 
     figure = Figure(figsize=(11, 4.5), dpi=100, layout="constrained")
     by_steps, by_hours = figure.subplots(1, 2, sharey=True)
-    styles = {model: cycle(("-", "--", "-.", ":", (0, (1, 3)))) for model in COLOURS}
+    styles: defaultdict[str, Iterator[Any]] = defaultdict(lambda: cycle(("-", "--", "-.", ":", (0, (1, 3)))))
     for run, points in groupby(rows, key=lambda row: row["run"]):
-        of_run, model = list(points), run.partition("-")[0]
-        style, colour = next(styles[model]), COLOURS[model]
+        of_run, (model, sampler, _) = list(points), run.split("-", 2)
+        colour = run_colour(model, sampler)
+        style = next(styles[colour])
         evaluated = [row for row in of_run if row["evaluation"]]
         for axes, key, unit in ((by_steps, "step", 1e6), (by_hours, "hours", 1)):
             axes.plot(*columns(of_run, key, "mean_20", unit), color=colour, linestyle=style, label=run, linewidth=1)

@@ -59,7 +59,9 @@ def test_emulators_share_the_cores_where_the_system_does_not_say_which_are_ours(
         emulators.reset(range(3), [0, 1, 2])
 
 
-@pytest.mark.parametrize(("asked", "cores", "workers"), [("null", 4, 3), ("null", 2, 1), ("null", 1, 1), ("2", 2, 2)])
+@pytest.mark.parametrize(
+    ("asked", "cores", "workers"), [("null", 128, 4), ("null", 4, 3), ("null", 2, 1), ("null", 1, 1), ("2", 2, 2)]
+)
 def test_an_evaluation_leaves_a_core_to_the_network(
     tiny: Callable[..., Config], monkeypatch: pytest.MonkeyPatch, asked: str, cores: int, workers: int
 ) -> None:

@@ -129,7 +129,7 @@ def _render(plot: Callable[["Axes"], None], title: str, alt: str, height: float 
     with _style():
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(4.8, height), layout="constrained")
+        figure = Figure(figsize=(4.8, height), dpi=150, facecolor="white", layout="constrained")
         plot(figure.add_subplot())
         png = _png(figure)
         figure.set_layout_engine("none")  # the layout is found, once for both pictures
@@ -148,8 +148,6 @@ def _png(figure: "Figure") -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     buffer = io.BytesIO()
-    figure.set_dpi(150)
-    figure.set_facecolor("white")
     # `savefig` would draw twice, the first time for the layout alone.
     FigureCanvasAgg(figure).print_png(buffer)  # type: ignore[no-untyped-call]
     return buffer.getvalue()

@@ -6,7 +6,7 @@ import os
 import signal
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import suppress
 from ctypes import Array, c_ubyte
 from multiprocessing.connection import Connection
@@ -81,7 +81,7 @@ class Emulators(ABC):
 
     def step(self, actions: Sequence[int] | npt.NDArray[np.int64], envs: Envs | None = None) -> Steps:
         """Plays a step of `envs` with one action each; none may be under way."""
-        self._refuse_sent(dict.fromkeys(range(self.num_envs), ()))
+        self._refuse_sent(range(self.num_envs))
         self.send(actions, envs)
         return self.receive()
 
@@ -122,8 +122,8 @@ class Emulators(ABC):
             self._results()
             self._unheard -= 1
 
-    def _refuse_sent(self, calls: Calls) -> None:
-        if any(int(env) in calls for envs in self._sent for env in envs):
+    def _refuse_sent(self, called: Container[int]) -> None:
+        if any(int(env) in called for envs in self._sent for env in envs):
             raise RuntimeError("a step was sent and not received")
 
     def _columns(self, envs: Envs) -> Steps:
