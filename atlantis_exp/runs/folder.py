@@ -118,6 +118,12 @@ class RunFolder:
         return None if result.outcome == "budget" and (budget is None or budget > result.steps) else result
 
     @property
+    def has_lost_checkpoints(self) -> bool:
+        """Whether there was a commit and there is no checkpoint, as in a folder that was brought without them."""
+        commit = self.commit
+        return commit is not None and commit.offset > 0 and not any(self.checkpoints.glob("*/manifest.json"))
+
+    @property
     def commit(self) -> Commit | None:
         """What the run's writer last committed, None before its first commit or status."""
         return read_commit(self.path)

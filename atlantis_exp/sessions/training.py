@@ -91,6 +91,11 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
             adopt(folder.path, parent)
         print(f"the run that was here is kept as {kept}")
     if (result := folder.ended(config.budget.steps)) is None:
+        if folder.has_lost_checkpoints:
+            raise Fault(
+                f"run {folder.name}: its checkpoints are gone from {folder.checkpoints}: put them back, or begin anew "
+                "with resume=never, which keeps what is there"
+            )
         return False
     print(f"run {folder.name} has ended ({result.outcome} after {result.steps:,} steps):\n")
     print(result.report)

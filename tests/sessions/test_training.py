@@ -120,6 +120,26 @@ def test_a_run_that_has_ended_is_reported_and_not_trained_again(
     assert folder.state == "done"
 
 
+@pytest.mark.parametrize("gone", [".", "*/manifest.json"])
+def test_a_run_whose_checkpoints_are_gone_is_not_begun_anew_by_a_larger_budget(
+    tiny: Compose, capsys: pytest.CaptureFixture[str], gone: str
+) -> None:
+    short, longer = (tiny(f"budget.steps={steps}", "evaluation.every_steps=null") for steps in (80, 120))
+    train(Job(short))
+    folder = RunFolder.of(short)
+    for path in [folder.checkpoints] if gone == "." else folder.checkpoints.glob(gone):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    files = {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
+    with pytest.raises(Fault, match=f"run {folder.name}: its checkpoints are gone from {folder.checkpoints}"):
+        train(Job(longer))
+    assert {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()} == files
+    capsys.readouterr()
+    train(Job(short))
+    assert "has ended (budget after 80 steps)" in capsys.readouterr().out
+    train(Job(dataclasses.replace(longer, resume="never")))
+    assert (RunFolder(folder.path.with_name(f"{folder.name}~1")).path / "result.json").exists()
+
+
 @pytest.mark.slow
 def test_a_larger_budget_continues_a_run_that_its_budget_ended(tiny: Compose) -> None:
     for steps in ("80", "120", "null"):
