@@ -67,11 +67,13 @@ class _Run:
         )
 
     def _left(self) -> str:
-        hours = self.values.get("throughput/hours", 0.0)
-        if self.state != "running" or not hours or not self.done:
+        """At the speed shown, as the run's own line; of a plan in episodes, whose steps nobody knows, at its mean."""
+        hours, speed = self.values.get("throughput/hours"), self.values.get("throughput/steps_per_second")
+        if self.state != "running" or not hours or not speed or not self.done:
             return ""
+        seconds = 1 / speed if self.unit == "steps" else hours * 3600 / self.done
         since = time.time() - self._updated / 1000
-        return terminal.clock(hours * 3600 * (self.length - self.done) / self.done - since)
+        return terminal.clock((self.length - self.done) * seconds - since)
 
 
 class LiveTable:
