@@ -126,7 +126,7 @@ class Progress:
             self.say(f"  film: {drawn:,} of {pictures:,} steps")
 
     def evaluated(self, step: int, frames: int, evaluation: "Evaluation") -> None:
-        """To be called after every evaluation of a training, with the steps and frames that it has trained for."""
+        """To be called after every evaluation of a training, with its step and the frames that were trained for."""
         summary, game = evaluation.summary, evaluation.game
         self.say(
             f"step {step:,}, {summary.episodes} episodes evaluated at epsilon {evaluation.epsilon}: "

@@ -73,7 +73,7 @@ class Recorder:
         self.best_step = -1
         self.best_sha256 = ""  # of the weights evaluated there, as a file
         self.evaluations = 0
-        self.evaluated_at = -1  # steps
+        self.evaluated_at = -1  # step, as it was written down
         self.evaluation_pending = False  # of this very step: it was asked to stop; redone on resume
         self.last_report = ""  # of the latest evaluation
         self.last_metrics: dict[str, float] = {}  # of the latest evaluation
@@ -156,13 +156,14 @@ class Recorder:
 
     def evaluate(self, counters: Counters, num_envs: int, has_ended: bool, stop: Stop) -> None:
         """Evaluate this step's network, unless that is done, and keep its weights; pending where it is stopped."""
-        if counters.steps == self.evaluated_at:
-            return
         step = counters.steps
-        if every := self.cadence.evaluate_steps:
-            # As with the curves: one that fell due on the way to this step belongs to where it fell due.
+        if (every := self.cadence.evaluate_steps) and not has_ended:
+            # As with the curves: one that fell due on the way to this step belongs to where it fell due. The last one
+            # belongs to the run's last step, where a comparison looks for it.
             due = step - step % every
             step = due if step - due < num_envs else step
+        if step == self.evaluated_at:
+            return
         self.evaluation_pending = True
         try:
             episodes = self.cadence.final_episodes if has_ended else self.cadence.interim_episodes
@@ -194,11 +195,11 @@ class Recorder:
             self.tracker.tags({"best_evaluation": f"mean {evaluation.summary.mean:,.0f} at step {step}"})
             if video is not None:
                 self.tracker.artifact(BEST_EPISODE, video)
-        self.evaluated_at, self.last_report = counters.steps, evaluation.report()
+        self.evaluated_at, self.last_report = step, evaluation.report()
         self.last_metrics = metrics
         self._write_episodes()
         self._describe("running", counters)
-        self.progress.evaluated(counters.steps, counters.frames, evaluation)
+        self.progress.evaluated(step, counters.frames, evaluation)
 
     def recent_scores(self, count: int) -> list[float]:
         """The scores of the last `count` episodes, the latest last."""

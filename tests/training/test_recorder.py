@@ -3,6 +3,7 @@
 import csv
 import io
 import itertools
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -55,7 +56,7 @@ def test_curves_of_any_num_envs_share_their_steps_and_raw_scores_stand_where_the
         for key in ("score/mean_20", "score/mean_100", "score/length_mean_100", "throughput/episodes"):
             assert {step % 20 for step, _ in curve(tmp_path / f"{num_envs}", key)} == {0}, key
         evaluated = [step for step, _ in curve(tmp_path / f"{num_envs}", "evaluation/mean")]
-        assert evaluated == [80, 160]
+        assert evaluated == [80, trainer.counters.steps]
         raw = curve(tmp_path / f"{num_envs}", "score/episode")
         assert [step for step, _ in raw] == [played.step for played in trainer.recorder.episodes]
         assert {step % 35 for step, _ in raw} == {0}
@@ -115,6 +116,23 @@ def test_the_description_says_how_the_run_stands_and_what_its_last_evaluation_wa
     assert "**finished** at step 160" in notes()[-1]
     assert f"| 160 | {mean:,.0f} |" in notes()[-1]
     assert f"The best mean so far is {recorder.best_mean:,.0f}, at step {recorder.best_step:,}." in notes()[-1]
+
+
+def test_every_number_of_an_evaluation_is_said_at_one_step_and_the_last_ones_is_where_the_run_ended(
+    small: Small, tmp_path: Path
+) -> None:
+    told = io.StringIO()
+    trainer = small(tmp_path, console=Console(file=told, width=200), num_envs=7, evaluate_steps=40)
+    trainer.run()
+    steps = [step for step, _ in curve(tmp_path, "evaluation/mean")]
+    assert steps == [40, 80, 120, 161]
+    assert trainer.counters.steps == 161
+    tables = sorted(path.name for path in (tmp_path / "artifacts" / "evaluation").glob("*.csv"))
+    assert tables == [f"{step:09d}.csv" for step in steps]
+    assert re.findall(r"step (\d+), 2 episodes evaluated", told.getvalue()) == [*map(str, steps)]
+    tags = [record.values for _, record in read(tmp_path) if isinstance(record, Tags)]
+    notes = [values[NOTE] for values in tags if NOTE in values]
+    assert re.findall(r"\n\| (\d+) \|", notes[-1]) == ["161"]
 
 
 def test_a_clock_that_steps_back_harms_no_metric(small: Small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
