@@ -204,39 +204,47 @@ def resolve(key: str, config: Mapping[str, Any]) -> str:
     return next((name for name in (key, f"{key}.name", f"{key}.id") if name in config), "")
 
 
-def refuse_mixed_protocols(trainings: Sequence[Training], by: Sequence[str]) -> None:
-    """Raise ConfigError where scores do not mean the same, but for the keys of `by`, which are the question.
+def mixed_protocol(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -> tuple[str, str] | None:
+    """What of the protocol differs, `game` or a key, and a sentence of it; None where scores mean the same.
 
-    Those of different games never do.
+    What is asked by the keys of `by` may differ, but for the game.
+
+    Args:
+        configs: by the names of runs or contenders, with dotted keys.
     """
-    games = defaultdict(list)
-    for training in trainings:
-        games[title_of(training.config["env.id"])].append(training.name)
-    if len(games) > 1:
-        named = _holding(dict(sorted(games.items())))
-        raise ConfigError(
-            f"env.id differs: scores of different games are not compared: {named}; choose with runs= or where=env.id=ID"
-        )
+    games = {name: title_of(config["env.id"]) for name, config in configs.items()}
+    if len(set(games.values())) > 1:
+        return "game", f"env.id differs: scores of different games are not compared: {_holders(games)}"
+    asked = {resolve(key, config) for key in by for config in configs.values()}
     for key in PROTOCOL:
-        if any(key == resolve(asked, training.config) for asked in by for training in trainings):
-            continue
-        holders = defaultdict(list)
-        for training in trainings:
-            holders[json.dumps(training.config[key])].append(training.name)
-        if len(holders) > 1:
-            hint = (
-                "at_epsilon=VALUE takes evaluations at that one, `evaluate run=NAME epsilon=VALUE` makes them"
-                if key == "evaluation.epsilon"
-                else f"choose with runs= or where=, or ask for it with by={key}"
-            )
-            raise ConfigError(f"{key} differs, so the scores do not mean the same: {_holding(holders)}; {hint}")
+        values = {name: json.dumps(config[key]) for name, config in configs.items()}
+        if key not in asked and len(set(values.values())) > 1:
+            return key, f"{key} differs, so the scores do not mean the same: {_holders(values)}"
+    return None
 
 
-def _holding(holders: Mapping[str, Sequence[str]]) -> str:
-    """Which runs have which value."""
+def refuse_mixed_protocols(trainings: Sequence[Training], by: Sequence[str]) -> None:
+    """Raise ConfigError where the scores of trainings do not mean the same, though not because of a key of `by`."""
+    if (mixed := mixed_protocol({training.name: training.config for training in trainings}, by)) is None:
+        return
+    key, sentence = mixed
+    hints = {
+        "game": "choose with runs= or where=env.id=ID",
+        "evaluation.epsilon": (
+            "at_epsilon=VALUE takes evaluations at that one, `evaluate run=NAME epsilon=VALUE` makes them"
+        ),
+    }
+    raise ConfigError(f"{sentence}; {hints.get(key, f'choose with runs= or where=, or ask for it with by={key}')}")
+
+
+def _holders(values: Mapping[str, str]) -> str:
+    """Whose value is which."""
+    names = defaultdict(list)
+    for name, value in values.items():
+        names[value].append(name)
     return "; ".join(
-        f"{value} in {names[0]}{f' and {len(names) - 1} more' if len(names) > 1 else ''}"
-        for value, names in holders.items()
+        f"{value} in {first}{f' and {len(others)} more' if others else ''}"
+        for value, (first, *others) in sorted(names.items())
     )
 
 

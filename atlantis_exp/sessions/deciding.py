@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -19,7 +20,7 @@ from atlantis_exp import terminal
 from atlantis_exp.build import build_trainer
 from atlantis_exp.checking import digest, flatten, to_dict
 from atlantis_exp.comparison.comparing import compare
-from atlantis_exp.comparison.gather import resolve, values_in
+from atlantis_exp.comparison.gather import mixed_protocol, resolve, values_in
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.comparison.tables import Comparison
 from atlantis_exp.comparison.verdict import Family, Group, Question, families, wanted
@@ -57,7 +58,8 @@ def decide(request: Request) -> None:
     """Train the contenders' seeds in the order of the plan, look, drop what is decided, and say the answer.
 
     Raises:
-        ConfigError: where two contenders are the same training, or the baseline is none of them.
+        ConfigError: where two contenders are the same training, their scores would not mean the same, or the baseline
+            is none of them.
         Fault: where a training fails, or a contender's seeds cannot be told apart; the same command goes on.
     """
     session = _Session.of(request)
@@ -103,6 +105,7 @@ class _Session:
     def of(cls, request: Request) -> "_Session":
         question = request.question
         contenders: dict[str, tuple[tuple[str, ...], Job]] = {}
+        configs: dict[str, dict[str, Any]] = {}
         groups = []
         for chosen in request.contenders:
             job = request.job_of((*request.fixed, *chosen))
@@ -114,8 +117,10 @@ class _Session:
             group = Group(values_in(facts, question.by), {})
             if group.label in contenders:
                 raise ConfigError(f"{' '.join(chosen)}: the same contender as {' '.join(contenders[group.label][0])}")
-            contenders[group.label] = chosen, job
+            contenders[group.label], configs[group.label] = (chosen, job), facts
             groups.append(group)
+        if mixed := mixed_protocol(configs, question.by):
+            raise ConfigError(f"{mixed[1]}; give that key itself several values, or train them under one protocol")
         asked = families(groups, question)
         config = next(iter(contenders.values()))[1].config
         session = cls(request, contenders, asked, RunFolder(Path(config.paths.outputs)))

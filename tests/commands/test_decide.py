@@ -29,6 +29,11 @@ Command = Callable[..., int]
         (("model=cnn,rsenet",), "model=rsenet: no such option in conf/model; did you mean 'resnet'?"),
         (("optimizer.lr=0.001,1e-3",), "optimizer.lr=0.001: the same contender as optimizer.lr=0.001"),
         (("model=cnn,resnet", "baseline=resnte"), "baseline=resnte: no such group; did you mean 'resnet'?"),
+        (
+            ("env=atlantis_v0,atlantis_v5",),
+            "env.frameskip differs, so the scores do not mean the same: 4 in ALE/Atlantis-v5; [2, 5] in Atlantis-v0; "
+            "give that key itself several values, or train them under one protocol",
+        ),
         (("model=cnn,resnet", "delta=5pt"), "delta=5pt: write a share of a score, as in delta=5%, or points"),
         (("model=cnn,resnet", "seeds=4"), "seeds=4: should be greater than or equal to 5"),
         (("model=cnn,resnet", "error=0"), "error=0: should be greater than 0"),
