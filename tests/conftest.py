@@ -253,6 +253,7 @@ def recorded(tiny: Callable[..., Config]) -> Callable[..., Path]:
         flops: int | None = 100,
         truncated: int = 0,
         steps: int = 160,
+        outcome: str = "finished",
     ) -> Path:
         config = tiny(*overrides)
         game = facts_of(config.game)
@@ -274,7 +275,7 @@ def recorded(tiny: Callable[..., Config]) -> Callable[..., Path]:
         evaluation = Evaluation(config.evaluation.epsilon, episodes, game)
         journal.artifact(evaluation_at(steps), evaluation.table().to_csv().encode())
         journal.finish()
-        folder.write_result(Result("finished", steps, {}, evaluation.metrics(), evaluation.report()))
+        folder.write_result(Result(outcome, steps, {}, evaluation.metrics(), evaluation.report()))
         return folder.path
 
     return record

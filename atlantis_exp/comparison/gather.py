@@ -52,7 +52,7 @@ class Training:
     """A finished training: its config, its learning curve and its evaluation after the last step."""
 
     name: str
-    config: dict[str, Any]  # dotted keys; `evaluation.epsilon` is that of the evaluation taken
+    config: dict[str, Any]  # dotted keys; the epsilon of the evaluation taken, and the budget if it ended the training
     science: dict[str, Any]  # the dotted keys that decide its numbers
     curve: dict[str, Array]  # frames, hours, flops (where recorded), epsilon, score (mean of the last 100 episodes)
     episodes: EpisodeTable
@@ -306,7 +306,8 @@ def _training(
     policy = (tags if player == folder else read_tags(player.path)).get("policy", "")
     science = config.science()
     science["phase"] = {str(index): phase for index, phase in enumerate(science["phase"])}
-    leaves = flatten(to_dict(config)) | {"evaluation.epsilon": taken}
+    budget = config.budget.steps if folder.result.outcome == "budget" else None
+    leaves = flatten(to_dict(config)) | {"evaluation.epsilon": taken, "budget.steps": budget}
     return Training(
         folder.name, leaves, flatten(science), arrays, _episodes(path, facts_of(config.env.game).sources), tags, policy
     )

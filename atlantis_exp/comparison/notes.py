@@ -84,6 +84,17 @@ def different_makers(facts: Facts) -> Iterator[str]:
             yield f"The runs were made in different {called}: {named}."
 
 
+def different_lengths(facts: Facts) -> Iterator[str]:
+    """Budgets that ended trainings, which do not enter a run's identity either."""
+    holders = defaultdict(list)
+    for run in facts.trainings:
+        budget = run.config["budget.steps"]
+        holders["the whole plan" if budget is None else f"budget.steps={budget:,}"].append(run.name)
+    if len(holders) > 1 and "budget.steps" not in facts.by:
+        named = "; ".join(f"{length}: {_listed(names)}" for length, names in holders.items())
+        yield f"The runs were not trained equally long: {named}."
+
+
 def lossy(facts: Facts) -> Iterator[str]:
     """Runs that went on without a part of their replay memory."""
     if names := [run.name for run in facts.trainings if LOST in run.tags]:
@@ -241,6 +252,7 @@ BESIDE: Sequence[Callable[[Facts], Iterator[str]]] = (
     equal_across,
     modes_found,
     different_makers,
+    different_lengths,
     lossy,
     uncommitted,
     unbalanced,

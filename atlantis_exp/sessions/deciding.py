@@ -58,8 +58,8 @@ def decide(request: Request) -> None:
     """Train the contenders' seeds in the order of the plan, look, drop what is decided, and say the answer.
 
     Raises:
-        ConfigError: where two contenders are the same training, their scores would not mean the same, or the baseline
-            is none of them.
+        ConfigError: where two contenders are the same training, their scores would not mean the same, a run was trained
+            for longer, or the baseline is none of them.
         Fault: where a training fails, or a contender's seeds cannot be told apart; the same command goes on.
     """
     session = _Session.of(request)
@@ -124,6 +124,7 @@ class _Session:
         asked = families(groups, question)
         config = next(iter(contenders.values()))[1].config
         session = cls(request, contenders, asked, RunFolder(Path(config.paths.outputs)))
+        session.refuse_longer_runs()
         identity = {
             **vars(question),
             "runs": sorted(folder.name for folder in session.runs),
@@ -184,6 +185,20 @@ class _Session:
 
     def _has_ended(self, folder: RunFolder) -> bool:
         return folder.ended(self._first.config.budget.steps) is not None
+
+    def refuse_longer_runs(self) -> None:
+        """Raise ConfigError where a run that would be a seed was trained for more steps than are asked for."""
+        steps = self._first.config.budget.steps
+        if steps is None:
+            return
+        for folder in self.runs:
+            # All environments step at once, so that the last of these steps may end beyond the budget.
+            result = folder.result
+            if result is not None and result.steps - folder.trained_config.env.num_envs >= steps:
+                raise ConfigError(
+                    f"budget.steps={steps}: run {folder.name} was trained for {result.steps:,} steps; ask for as many, "
+                    "or for other paths.outputs"
+                )
 
     def look(self) -> Comparison | None:
         """The comparison of what is there, with the look that is due; None until all have the first look's seeds."""

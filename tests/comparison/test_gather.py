@@ -110,6 +110,12 @@ def test_the_latest_evaluation_after_the_last_step_counts_and_epsilon_chooses_am
     assert none.skipped[run.name].startswith("no evaluation at epsilon 0.3")
 
 
+def test_only_a_budget_that_ended_its_training_is_one_of_the_run(recorded: Recorded, tmp_path: Path) -> None:
+    recorded("model=cnn", "budget.steps=160", outcome="budget")
+    recorded("model=resnet", "budget.steps=900")
+    assert [run.config["budget.steps"] for run in gather(tmp_path).trainings] == [160, None]
+
+
 def test_a_run_without_flops_has_no_such_curve(recorded: Recorded, tmp_path: Path) -> None:
     recorded(flops=None)
     assert set(gather(tmp_path).trainings[0].curve) == {"frames", "hours", "epsilon", "score"}

@@ -444,6 +444,18 @@ def test_runs_of_different_precisions_or_devices_are_named() -> None:
     assert "devices" not in beside
 
 
+def test_runs_that_were_not_trained_equally_long_are_named_unless_that_is_the_question() -> None:
+    runs = [*around("cnn", 3_000.0), *around("resnet", 5_000.0)]
+    assert not any("equally long" in line for line in compared(runs).beside)
+    for run in runs[:5]:
+        run.config["budget.steps"] = 4_000
+    said = "The runs were not trained equally long: budget.steps=4,000: cnn-uniform-s0, "
+    assert any(
+        line.startswith(said) and "; the whole plan: resnet-uniform-s0, " in line for line in compared(runs).beside
+    )
+    assert not any("equally long" in line for line in compared(runs, "model", "budget.steps").beside)
+
+
 def test_who_leads_while_training_is_said_as_a_description() -> None:
     def curve(end: float) -> dict[str, Any]:
         return {"frames": np.array([0.0, 100.0]), "epsilon": np.zeros(2), "score": np.array([0.0, end])}

@@ -19,7 +19,7 @@ from atlantis_exp.commands.compare import VERB as COMPARE
 from atlantis_exp.commands.decide import DecideConfig, request_of
 from atlantis_exp.commands.overrides import check, swept
 from atlantis_exp.config import Config
-from atlantis_exp.faults import Fault
+from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import read_commit
 from atlantis_exp.sessions.deciding import _Session, decide
@@ -201,6 +201,18 @@ def test_a_run_that_cannot_be_compared_is_named(asking: Asking, recorded: Record
     table.unlink()
     with pytest.raises(Fault, match=f"^run {run.name} has ended and cannot be compared; above it says why$"):
         decide(session.request)
+
+
+def test_a_run_that_was_trained_longer_than_is_asked_is_no_seed_of_the_question(
+    asking: Asking, recorded: Recorded
+) -> None:
+    record_seeds(recorded, 1_000, range(5), "model=cnn")
+    longer = recorded("model=resnet", "seed=3", "budget.steps=900", outcome="budget", steps=900)
+    line = (
+        f"^budget.steps=160: run {longer.name} was trained for 900 steps; ask for as many, or for other paths.outputs$"
+    )
+    with pytest.raises(ConfigError, match=line):
+        asking("model=cnn,resnet", "budget.steps=160")
 
 
 @pytest.mark.slow
