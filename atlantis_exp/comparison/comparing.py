@@ -1,5 +1,6 @@
 """A comparison as a run of its own: verdict, tables, figures and page of groups of finished runs."""
 
+import json
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -160,16 +161,20 @@ def worse_than_baseline(answers: Sequence[Answer]) -> list[str]:
 
 
 def _recipes(runs: Sequence[Training]) -> list[str]:
-    """What a group's runs are but for their seeds: their science, how long they trained and how they were evaluated."""
-    return sorted(
-        {
-            digest(
-                {key: value for key, value in run.science.items() if key != "seed"}
-                | {key: run.config[key] for key in ("budget.steps", "evaluation.epsilon")}
-            )
-            for run in runs
-        }
-    )
+    """What a group's runs are but for their seeds: their science, how long they trained and how they were evaluated.
+
+    A key that differs between seeds, but not between runs of one seed, may follow from the seed and says nothing: with
+    evaluation.seed=${seed} each further seed would else make another comparison, without the looks taken before.
+    """
+    recipes = [run.science | {key: run.config[key] for key in ("budget.steps", "evaluation.epsilon")} for run in runs]
+    seeds = {run.config["seed"] for run in runs}
+
+    def follows(key: str) -> bool:
+        values = {(run.config["seed"], json.dumps(recipe.get(key))) for run, recipe in zip(runs, recipes, strict=True)}
+        return len(values) == len(seeds) > 1 and len({value for _, value in values}) > 1
+
+    left_out = {key for recipe in recipes for key in recipe if follows(key)} | {"seed"}
+    return sorted({digest({key: recipe[key] for key in recipe.keys() - left_out}) for recipe in recipes})
 
 
 def _metrics(comparison: Comparison) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -67,6 +68,24 @@ def test_the_same_comparison_again_is_the_same_run(recorded: Recorded, tmp_path:
     for _ in range(2):
         VERB.run([f"paths.outputs={tmp_path}", "tracking=none"])
     assert len(list((tmp_path / "comparisons").iterdir())) == 1
+
+
+@pytest.mark.slow
+def test_what_follows_from_the_seed_makes_no_other_comparison_and_another_recipe_does(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    def compared(seeds: range, lr: str) -> int:
+        for seed in seeds:
+            for model, score in (("cnn", 1_000.0), ("resnet", 1_015.0)):
+                overrides = (f"seed={seed}", f"evaluation.seed={100 + seed}", f"optimizer.lr={lr}")
+                recorded(f"model={model}", *overrides, scores=(score - 40 * (seed % 5), score, score + 9 + seed))
+        VERB.run([f"paths.outputs={tmp_path}", "tracking=none"])
+        return len(list((tmp_path / "comparisons").glob("*/looks.json")))
+
+    assert compared(range(5), "0.001") == 1
+    assert compared(range(5, 10), "0.001") == 1
+    shutil.rmtree(tmp_path / "runs")
+    assert compared(range(5), "0.002") == 2
 
 
 @pytest.mark.parametrize(
