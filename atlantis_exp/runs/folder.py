@@ -54,6 +54,7 @@ class Result:
     counts: dict[str, float]  # episodes, frames, updates and hours of a training
     evaluation: dict[str, float]  # empty where there was none
     report: str
+    evaluated_at: int | None = None  # step of the last evaluation, where that was before the last one
 
     def __post_init__(self) -> None:
         if self.evaluation and (missing := EVALUATED - self.evaluation.keys()):

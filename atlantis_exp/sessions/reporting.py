@@ -30,7 +30,8 @@ def report(*, paths: PathsConfig) -> None:
     results = [run.result for run in runs]
     for run, result in zip(runs, results, strict=True):
         if result is not None:
-            table.add_row(run.name, f"{result.steps:,}", *_cells(result.evaluation))
+            earlier = f" (evaluated at {result.evaluated_at:,})" if result.evaluated_at is not None else ""
+            table.add_row(run.name, f"{result.steps:,}{earlier}", *_cells(result.evaluation))
             continue
         step, evaluation = _last_evaluation(run)
         table.add_row(run.name, f"{step:,} ({run.state})" if evaluation else run.state, *_cells(evaluation))

@@ -183,7 +183,6 @@ def expected(trainer: Trainer, config: Config, steps_done: int) -> Forecast:
         size=config.env.size,
         stack=config.env.stack,
         steps_done=steps_done,
-        evaluations_an_episode=1 / (config.evaluation.every_episodes or float("inf")),
     )
 
 
@@ -224,7 +223,11 @@ def _close(trainer: Trainer, folder: RunFolder, journal: Journal, outcome: Outco
         "hours": counters.seconds / 3600,
     }
     report = recorder.last_report or "no evaluation (evaluation.at_end=false)"
-    result = Result(outcome, counters.steps, counts, recorder.last_metrics, report)
+    earlier = None
+    if recorder.last_report and recorder.evaluated_at != counters.steps:
+        earlier = recorder.evaluated_at
+        report = f"evaluated last at step {earlier:,} of {counters.steps:,} (evaluation.at_end=false):\n{report}"
+    result = Result(outcome, counters.steps, counts, recorder.last_metrics, report, earlier)
     journal.status("KILLED" if outcome == "interrupted" else "FINISHED")
     if outcome != "interrupted":  # while it is still published: a server is sent the result, too
         folder.write_result(result)

@@ -1,6 +1,7 @@
 """The budget planner: what a training will cost on this machine, from a few seconds of measurement on it."""
 
 import copy
+import math
 import shutil
 import statistics
 import time
@@ -64,7 +65,6 @@ def forecast(
     size: int,
     stack: int,
     steps_done: int,
-    evaluations_an_episode: float,
 ) -> Forecast:
     """Time emulation, acting and learning with a trainer's parts, which are as before afterwards.
 
@@ -104,7 +104,9 @@ def forecast(
     stored = min(capacity, steps_done + steps)
     replay_bytes = min(max_bytes, stored * memory.nbytes // memory.next_id)
     weights = sum(tensor.nbytes for tensor in learner.network.state_dict().values())
-    evaluations = 1 + evaluations_an_episode * steps / emulators.game.episode_steps
+    cadence = trainer.recorder.cadence
+    evaluations = 1 + steps / (cadence.evaluate_steps or math.inf)
+    evaluations += steps / emulators.game.episode_steps / (cadence.evaluate_episodes or math.inf)
     return Forecast(
         steps_per_second=1 / seconds_a_step,
         steps=steps,

@@ -24,6 +24,7 @@ from atlantis_exp.runs.facts import read_facts
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Artifact, Image, Journal, Metrics, Model, read
 from atlantis_exp.sessions.job import Job, replaced
+from atlantis_exp.sessions.reporting import report
 from atlantis_exp.sessions.training import train
 from atlantis_exp.sessions.verifying import fingerprints, train_and_kill
 from atlantis_exp.tracking.publishing import catch_up
@@ -138,6 +139,16 @@ def test_a_run_whose_checkpoints_are_gone_is_not_begun_anew_by_a_larger_budget(
     assert "has ended (budget after 80 steps)" in capsys.readouterr().out
     train(Job(dataclasses.replace(longer, resume="never")))
     assert (RunFolder(folder.path.with_name(f"{folder.name}~1")).path / "result.json").exists()
+
+
+def test_scores_of_an_evaluation_before_the_last_step_are_said_to_be(
+    tiny: Compose, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tiny("evaluation.at_end=false", "evaluation.every_steps=70")
+    train(Job(config))
+    assert "\nevaluated last at step 140 of 160 (evaluation.at_end=false):\n" in capsys.readouterr().out
+    report(paths=config.paths)
+    assert "160 (evaluated at 140)" in capsys.readouterr().out
 
 
 @pytest.mark.slow

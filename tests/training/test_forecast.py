@@ -37,7 +37,7 @@ def timed(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
 
 
 def expected_of(trainer: Trainer, size: int, **chosen: Any) -> Forecast:
-    asked = {"capacity": 120, "max_bytes": 2**22, "steps_done": trainer.counters.steps, "evaluations_an_episode": 0.0}
+    asked = {"capacity": 120, "max_bytes": 2**22, "steps_done": trainer.counters.steps}
     return forecast(trainer, size=size, stack=4, **{**asked, **chosen})
 
 
@@ -98,7 +98,7 @@ def test_a_real_training_is_none_the_wiser_of_forecasts_at_its_start_and_when_it
 
 
 def test_what_is_left_is_expected_of_a_training(small: Callable[..., Trainer], tmp_path: Path) -> None:
-    trainer = small(tmp_path, num_envs=2, epsilon=lambda *_: 0.5, learn_every=4)
+    trainer = small(tmp_path, num_envs=2, epsilon=lambda *_: 0.5, learn_every=4, evaluate_steps=None)
     whole = expected_of(trainer, 8)
     seconds_a_step = (1e-3 + 0.75 * 1e-3) / 2 + 1e-3 / 4
     assert whole.steps == 160
@@ -108,9 +108,13 @@ def test_what_is_left_is_expected_of_a_training(small: Callable[..., Trainer], t
     assert expected_of(small(tmp_path, max_steps=50), 8, steps_done=20).steps == 30
     assert expected_of(trainer, 8, steps_done=500).steps == 1
     assert expected_of(trainer, 8, max_bytes=1_000).memory == 1_000 + 2**29
-    more = expected_of(trainer, 8, evaluations_an_episode=1_000.0)
     weights = sum(tensor.nbytes for tensor in trainer.learner.network.state_dict().values())
-    assert more.disk - whole.disk == pytest.approx(2 * weights * 1_000 * 160 / 2_000, abs=1)
+    for due, evaluations in (
+        ({"evaluate_steps": 2}, 80),
+        ({"evaluate_steps": None, "evaluate_episodes": 1}, 160 / 2_000),
+    ):
+        more = expected_of(small(tmp_path, num_envs=2, **due), 8)
+        assert more.disk - whole.disk == pytest.approx(2 * weights * evaluations, abs=1)
 
 
 @pytest.mark.parametrize(
