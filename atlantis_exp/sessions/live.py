@@ -111,9 +111,10 @@ class LiveTable:
 
     def _say(self) -> None:
         for run in self._runs:
-            name, state, done, speed, left, score = cells = run.cells
-            if self._said.get(name, (name, "queued", "", "", "", "")) != cells:
-                self._said[name] = cells
+            name, state, done, speed, left, score = run.cells
+            news = state, done, speed, score  # that time passes is none
+            if self._said.get(name, ("queued", "", "", "")) != news:
+                self._said[name] = news
                 parts = [done, speed and f"{speed} steps/s", left and f"left {left}", score and f"last score {score}"]
                 self._console.print(f"  {state:12}{name}  {'  '.join(filter(None, parts))}")
 

@@ -140,7 +140,9 @@ def test_emulator_workers_keep_to_their_share_and_leave_the_identity_alone(
             assert len(emulators._processes) == workers  # type: ignore[attr-defined]
 
 
-def test_the_table_follows_the_commits_of_runs(tiny: Compose, recorded: Callable[..., Path]) -> None:
+def test_the_table_follows_the_commits_of_runs(
+    tiny: Compose, recorded: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     jobs = [Job(tiny(f"seed={seed}")) for seed in (0, 1)]
     folders = [RunFolder.of(job.config) for job in jobs]
     folder = folders[0]
@@ -158,7 +160,10 @@ def test_the_table_follows_the_commits_of_runs(tiny: Compose, recorded: Callable
             table.look()
             journal.metrics({"score/episode": -1.0}, step + 1)  # which no commit covers yet
             journal.state_dict()
-            table.look()
+            with monkeypatch.context() as later:
+                now = time.time()
+                later.setattr(time, "time", lambda now=now: now + 2)  # less is left, which is no news
+                table.look()
     recorded("seed=1")
     table.look()
     drawn = io.StringIO()
