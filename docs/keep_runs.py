@@ -1,34 +1,31 @@
-"""Copy finished trainings to `docs/verdict/runs`: all that a comparison reads, without weights, films and places.
+"""Copy finished trainings to `TARGET/runs`: all that a comparison reads, without weights, films and places.
 
-`python docs/keep_runs.py OUTPUTS...`, from the root of the checkout.
+`python docs/keep_runs.py OUTPUTS TARGET`: `docs/verdict` and `docs/reproduction` are such targets.
 """
 
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from atlantis_exp.runs.folder import RunFolder, all_runs
 from atlantis_exp.runs.journal import commit_bytes, commit_of
 
-KEPT = Path("docs/verdict/runs")
 
-
-def main(outputs: Sequence[Path]) -> None:
-    """Copy the finished trainings of some outputs folders, in the place of what is there of the same names."""
-    for folder in outputs:
-        for run in all_runs(folder):
-            if run.result is not None:
-                keep(run, KEPT / run.name)
-                print(KEPT / run.name)
+def main(outputs: Path, target: Path) -> None:
+    """Copy the finished trainings of an outputs folder, in the place of what is there of the same names."""
+    for run in all_runs(outputs):
+        if run.result is not None:
+            kept = target / "runs" / run.name
+            keep(run, kept)
+            print(kept)
 
 
 def keep(run: RunFolder, target: Path) -> None:
     """Copy a run, whose outputs folder is then called `outputs` and which belongs to no sweep."""
-    place = run.path.parents[1]
+    place = bytes(run.path.parents[1].absolute())
 
     def without_place(content: bytes) -> bytes:
-        return content.replace(str(place.absolute()).encode(), b"outputs").replace(str(place).encode(), b"outputs")
+        return content.replace(place, b"outputs")
 
     commit = commit_of((run.path / "commit.json").read_bytes())
     journal = without_place((run.path / "journal.jsonl").read_bytes()[: commit.offset])
@@ -43,4 +40,4 @@ def keep(run: RunFolder, target: Path) -> None:
 
 
 if __name__ == "__main__":
-    main([Path(argument) for argument in sys.argv[1:]])
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
