@@ -1,4 +1,4 @@
-"""Copy finished trainings to `TARGET/runs`: all that a comparison reads, without weights, films and places.
+"""Copy finished runs to `TARGET/runs`: all that a comparison reads, without weights, films and places.
 
 `python docs/keep_runs.py OUTPUTS TARGET`: `docs/verdict` and `docs/reproduction` are such targets.
 """
@@ -8,11 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from atlantis_exp.runs.folder import RunFolder, all_runs
-from atlantis_exp.runs.journal import commit_bytes, commit_of
+from atlantis_exp.runs.journal import commit_bytes
 
 
 def main(outputs: Path, target: Path) -> None:
-    """Copy the finished trainings of an outputs folder, in the place of what is there of the same names."""
+    """Copy the finished runs of an outputs folder, in the place of what is there of the same names."""
     for run in all_runs(outputs):
         if run.result is not None:
             kept = target / "runs" / run.name
@@ -27,7 +27,8 @@ def keep(run: RunFolder, target: Path) -> None:
     def without_place(content: bytes) -> bytes:
         return content.replace(place, b"outputs")
 
-    commit = commit_of((run.path / "commit.json").read_bytes())
+    commit = run.commit
+    assert commit is not None
     journal = without_place((run.path / "journal.jsonl").read_bytes()[: commit.offset])
     files = {"journal.jsonl": journal, "commit.json": commit_bytes(replace(commit, offset=len(journal), parent=""))}
     names = ("config.json", "result.json", "artifacts/episodes.csv", "artifacts/evaluation/*.csv")
