@@ -14,6 +14,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from tables import RANDOM, updated
 
+from atlantis_exp.comparison.figures import thousands
 from atlantis_exp.media import GREY, run_colour
 from atlantis_exp.runs.folder import RunFolder, all_runs
 from atlantis_exp.runs.journal import Metrics, read, read_commit
@@ -50,6 +51,7 @@ def main(name: str, outputs: Sequence[Path]) -> None:
     for axes in (by_steps, by_hours):
         axes.axhline(RANDOM, color=GREY, linestyle=":", linewidth=1)
     by_steps.set(yscale="log", xlabel="million steps", ylabel="score: mean of 20 in training, evaluations as points")
+    thousands(by_steps.yaxis)
     by_steps.legend(frameon=False, fontsize="small")
     by_hours.set(xlabel="hours, whatever else the machine did")
     figure.savefig(f"docs/images/{name}.png")

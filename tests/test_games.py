@@ -199,7 +199,7 @@ def test_runs_of_two_games_are_not_compared(
 
 @pytest.mark.usefixtures("both")
 def test_a_game_is_compared_by_its_own_facts_and_without_its_plugin_by_none(
-    recorded: Recorded, command: Command, tmp_path: Path
+    recorded: Recorded, command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for seed in range(2):
         admit([BREAKOUT, PONG])
@@ -207,6 +207,7 @@ def test_a_game_is_compared_by_its_own_facts_and_without_its_plugin_by_none(
     pages, tables = [], []
     for plugins in ((), (BOTH,)):
         assert command("compare", "by=seed", *plugins, "tracking=none", f"paths.outputs={tmp_path}") == 0
+        assert "MLflow UI" not in capsys.readouterr().out  # no store
         (folder,) = (tmp_path / "comparisons").glob("*/artifacts")
         page = (folder / "comparison.html").read_text()
         pages.append(re.sub(r"<[^>]*>", " ", page))

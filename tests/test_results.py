@@ -2,6 +2,8 @@
 
 import csv
 import re
+import runpy
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -29,3 +31,26 @@ def test_a_kept_run_is_still_the_run_of_its_config_and_in_the_table_of_its_page(
     assert len(scores) == 100
     row = rf"^\| {run.trained_config.seed} \|.* {scores.mean():,.0f} \({interquartile_mean(scores):,.0f}\) \|"
     assert re.search(row, (DOCS / PAGES[page]).read_text(), re.MULTILINE)
+
+
+def test_a_run_that_is_kept_compares_as_it_did_and_names_no_place(
+    recorded: Callable[..., Path], command: Callable[..., int], tmp_path: Path
+) -> None:
+    for seed in range(2):
+        recorded(f"seed={seed}", scores=(1_000.0 + seed, 3_000.0))
+    for run in all_runs(tmp_path):
+        (run.path / "latest.safetensors").write_bytes(b"weights")
+    (tmp_path / "runs" / "begun").mkdir()
+    kept = tmp_path / "kept"
+    runpy.run_path(str(DOCS / "keep_runs.py"))["main"](tmp_path, kept)
+
+    files = [path for path in kept.rglob("*") if path.is_file()]
+    assert {path.suffix for path in files} == {".json", ".jsonl", ".csv"}
+    assert not [path for path in files if bytes(tmp_path) in path.read_bytes()]
+    tables = []
+    for outputs in (tmp_path, kept):
+        assert command("compare", "by=seed", "tracking=none", f"paths.outputs={outputs}") == 0
+        (page,) = outputs.glob("comparisons/*/artifacts")
+        tables.append({path.name: path.read_text() for path in page.glob("tables/*.csv") if path.stem != "skipped"})
+    assert tables[0] == tables[1]
+    assert len(tables[0]) >= 10

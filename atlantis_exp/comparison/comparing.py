@@ -36,8 +36,7 @@ from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
 from atlantis_exp.runs.folder import BEST_EPISODE, RunFolder
 from atlantis_exp.runs.provenance import provenance
-from atlantis_exp.tracking.publishing import publishing
-from atlantis_exp.tracking.views import how_to_open
+from atlantis_exp.tracking.publishing import how_to_open, publishing
 
 _PAGE = "comparison.html"
 
@@ -143,7 +142,7 @@ def compare(
     _print(comparison)
     players = [player for player in gathered.players if plays_alike(player, trainings[0])]
     _print_film(outputs, (*trainings, *players))
-    print(f"\n{how_to_open(outputs)}\n\n{folder.artifact(_PAGE)}")
+    print(f"{how_to_open(outputs)}\n{folder.artifact(_PAGE)}")
     if COMMIT in question.by and (worse := worse_than_baseline(comparison.answers)):
         raise Fault(f"worse than the baseline {question.baseline}: {'; '.join(worse)}")
     return comparison

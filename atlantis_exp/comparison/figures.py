@@ -178,7 +178,8 @@ def _look(groups: Sequence[str], group: str) -> dict[str, Any]:
     return {"color": _COLOURS[index % len(_COLOURS)], "linestyle": _LINES[index % len(_LINES)]}
 
 
-def _thousands(axis: Any) -> None:
+def thousands(axis: Any) -> None:
+    """Write 20k in the place of 2 x 10^4 at an axis, and on a logarithmic one between powers of ten."""
     from matplotlib.ticker import EngFormatter, LogFormatter
 
     written = EngFormatter(sep="")
@@ -241,8 +242,8 @@ def _learning(axes: "Axes", comparison: Comparison, axis: str, rows: Table) -> N
     axes.set_ylabel("training score, mean of 100")
     axes.locator_params(axis="x", nbins=5)
     if axis != "hours":
-        _thousands(axes.xaxis)
-    _thousands(axes.yaxis)
+        thousands(axes.xaxis)
+    thousands(axes.yaxis)
     _legend(axes)
 
 
@@ -256,7 +257,7 @@ def _exploration(axes: "Axes", comparison: Comparison, rows: Table) -> None:
     axes.set_xlabel(_UNITS["frames"])
     axes.set_ylabel("epsilon")
     axes.locator_params(axis="x", nbins=5)
-    _thousands(axes.xaxis)
+    thousands(axes.xaxis)
     _legend(axes)
 
 
@@ -280,7 +281,7 @@ def _scores(axes: "Axes", comparison: Comparison) -> None:
     axes.set_yticks(range(len(table)), [row["group"] for row in table])
     axes.set_ylim(len(table) - 0.4, -0.8)
     axes.set_xlabel("score, one dot a seed")
-    _thousands(axes.xaxis)
+    thousands(axes.xaxis)
     _legend(axes)
 
 
@@ -303,7 +304,7 @@ def _why(axes: "Axes", comparison: Comparison) -> None:
     axes.set_yticks(range(len(rows)), [row["group"] for row in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlabel("points per 1,000 frames")
-    _thousands(axes.xaxis)
+    thousands(axes.xaxis)
     _legend(axes)
 
 
@@ -320,7 +321,7 @@ def _distribution(axes: "Axes", comparison: Comparison) -> None:
         axes.hist(scores[group], edges.tolist(), weights=weights.tolist(), histtype="step", label=group, **look)
     axes.set_xlabel("score")
     axes.set_ylabel("share of episodes")
-    _thousands(axes.xaxis)
+    thousands(axes.xaxis)
     _legend(axes)
 
 
@@ -335,7 +336,7 @@ def _strips(axes: "Axes", comparison: Comparison) -> None:
     axes.set_yticks(range(len(comparison.groups)), comparison.groups)
     axes.set_ylim(len(comparison.groups) - 0.4, -0.8)
     axes.set_xlabel("score, one dot an episode")
-    _thousands(axes.xaxis)
+    thousands(axes.xaxis)
 
 
 def _profile(axes: "Axes", comparison: Comparison) -> None:
@@ -345,7 +346,7 @@ def _profile(axes: "Axes", comparison: Comparison) -> None:
         axes.plot(tau, share, label=group, **_look(comparison.groups, group))
     is_logarithmic = comparison.game.is_logarithmic
     axes.set_xscale("log" if is_logarithmic else "linear")
-    _thousands(axes.xaxis)
+    thousands(axes.xaxis)
     axes.set_xlabel(f"score{' (logarithmic)' if is_logarithmic else ''}")
     axes.set_ylabel("share of episodes above")
     axes.set_ylim(0, 1.03)
@@ -391,5 +392,5 @@ def _references(axes: "Axes", comparison: Comparison) -> None:
     for y, score in enumerate(scores):
         axes.annotate(f"{score:,.0f}", (score, y), (4, 0), textcoords="offset points", va="center", fontsize=7)
     axes.margins(x=0.12)
-    _thousands(axes.xaxis)
+    thousands(axes.xaxis)
     axes.set_xlabel(f"mean score{' (logarithmic)' if is_logarithmic else ''}")

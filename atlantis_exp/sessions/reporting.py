@@ -10,8 +10,7 @@ from atlantis_exp.config import PathsConfig
 from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.runs.folder import EVALUATED, RunFolder, all_runs
 from atlantis_exp.runs.journal import Metrics
-from atlantis_exp.tracking.publishing import catch_up
-from atlantis_exp.tracking.views import how_to_open
+from atlantis_exp.tracking.publishing import catch_up, how_to_open
 
 
 def report(*, paths: PathsConfig) -> None:
@@ -40,7 +39,7 @@ def report(*, paths: PathsConfig) -> None:
     for run, result in zip(runs, results, strict=True):
         if result is not None:
             console.print(f"\n{run.name}\n{result.report}")
-    console.print(f"\n{how_to_open(outputs)}")
+    console.print(how_to_open(outputs), end="")
 
 
 def _last_evaluation(run: RunFolder) -> tuple[int, Mapping[str, float]]:

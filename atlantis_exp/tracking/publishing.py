@@ -10,7 +10,8 @@ from atlantis_exp.config import TrackingConfig
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder, all_folders
 from atlantis_exp.runs.journal import Journal
-from atlantis_exp.tracking.store import Publisher, Store, brought, unfinished
+from atlantis_exp.terminal import PROGRAM
+from atlantis_exp.tracking.store import DATABASE, Publisher, Store, brought, unfinished
 
 _DRAIN_SECONDS = 20.0  # that a command waits for MLflow at its end; `catch_up` sends what is missing then
 
@@ -71,3 +72,11 @@ def catch_up(outputs: Path, continued: Path | None = None) -> None:
         with terminal.working(f"publishing {folder.name}, which an earlier command could not"):
             if not Publisher(folder.path, store).drain(_DRAIN_SECONDS):
                 unreachable.add(store.address)
+
+
+def how_to_open(outputs: Path) -> str:
+    """A paragraph that says what starts the UI on the store of an outputs folder; empty where there is no store."""
+    if not (outputs / DATABASE).exists():
+        return ""
+    shown = outputs.relative_to(Path.cwd()) if outputs.is_relative_to(Path.cwd()) else outputs
+    return f"\nthe MLflow UI: {PROGRAM} ui paths.outputs={shown}\n"

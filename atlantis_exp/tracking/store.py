@@ -55,6 +55,9 @@ P = TypeVar("P")
 
 _log = logging.getLogger(__name__)
 
+DATABASE = "mlflow.db"
+"""The local store, in an outputs folder."""
+
 _SECONDS = 60  # that a server may take for an answer, or for so many bytes of a file:
 _PIECE = 2**16
 _PAGES = 1_000  # of 1,000 runs each, that a server may list
@@ -100,7 +103,7 @@ class Store:
         self._root = root.resolve()
         self._experiment = experiment
         self.is_local = tracking_uri is None
-        self.uri = tracking_uri or f"sqlite:///{self._root / 'mlflow.db'}"
+        self.uri = tracking_uri or f"sqlite:///{self._root / DATABASE}"
 
     @property
     def client(self) -> "MlflowClient":
@@ -199,14 +202,14 @@ class Store:
         self._root.mkdir(parents=True, exist_ok=True)
         with alone(self._root / "mlflow.lock"):  # processes that make the tables together break them for good
             if self.is_local:
-                database_file = self._root / "mlflow.db"
+                database_file = self._root / DATABASE
                 if not database_file.exists():
                     # MLflow never recovers from a process that dies while it makes the tables: they are made aside.
                     aside = self._root / "mlflow.aside"
                     shutil.rmtree(aside, ignore_errors=True)
                     aside.mkdir()
-                    MlflowClient(f"sqlite:///{aside / 'mlflow.db'}").get_experiment_by_name(self._experiment)
-                    (aside / "mlflow.db").replace(database_file)
+                    MlflowClient(f"sqlite:///{aside / DATABASE}").get_experiment_by_name(self._experiment)
+                    (aside / DATABASE).replace(database_file)
                     shutil.rmtree(aside)
                 with closing(sqlite3.connect(database_file)) as database:
                     database.execute("PRAGMA journal_mode=WAL")  # else one slow reader makes a write fail

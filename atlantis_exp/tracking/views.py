@@ -6,11 +6,9 @@ A shared view is a tag of the experiment in a format that MLflow keeps to itself
 import base64
 import json
 import zlib
-from pathlib import Path
 from typing import Any
 
 from atlantis_exp.runs.journal import NOTE
-from atlantis_exp.terminal import PROGRAM
 
 _SECTIONS = {  # cards a row, and their height in pixels
     "evaluation": (2, 360),
@@ -47,12 +45,6 @@ _ABOUT = """\
   `episodes.csv` and every evaluation's table. *Models* lists the weights of each evaluation; `best` marks the best.
 - A sweep is a run, too: the table and figures of its runs are on its page.
 """
-
-
-def how_to_open(outputs: Path) -> str:
-    """Say what starts the UI on the store of an outputs folder."""
-    shown = outputs.relative_to(Path.cwd()) if outputs.is_relative_to(Path.cwd()) else outputs
-    return f"the MLflow UI: {PROGRAM} ui paths.outputs={shown}"
 
 
 def experiment_tags(newest: str | None) -> dict[str, str]:

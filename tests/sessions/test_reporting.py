@@ -31,7 +31,9 @@ def test_a_run_that_has_not_ended_has_its_last_evaluation(tmp_path: Path, capsys
         journal.metrics({"evaluation/mean": 7.0}, 2_000)  # no whole one
         journal.flush()
     report(paths=PathsConfig(outputs=str(tmp_path)))
-    none, two = (line for line in capsys.readouterr().out.splitlines() if line.startswith("│"))
+    shown = capsys.readouterr().out
+    assert ("the MLflow UI: " in shown) == (tmp_path / "mlflow.db").exists()
+    none, two = (line for line in shown.splitlines() if line.startswith("│"))
     assert none.replace("│", "").split() == ["none", "interrupted"]
     assert two.replace("│", "").split() == ["two", "1,000", "(interrupted)", *["1,000"] * 6, "100025.0%", "1000"]
 
