@@ -110,7 +110,7 @@ class Component:
             loaded: type[Any] = getattr(self.source.load(), self.class_name)
         return loaded
 
-    def beside(self, name: str) -> Path:
+    def data_path(self, name: str) -> Path:
         """The path of a file that comes with it: of `pong` and `scores.csv`, `pong_scores.csv` next to it."""
         return self.source.path.with_name(f"{self.name}_{name}")
 

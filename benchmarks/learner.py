@@ -5,7 +5,7 @@ forward and backward pass and of the target network's forward pass, no gradient 
 is all of `Learner.update`: uint8 in, loss, optimizer and soft update included. Each turn is compared with a
 multiplication of square matrices in the same number format, right before it in the same process.
 
-`--against OVERRIDE...` sets the same updates under these overrides beside them: `compile=true`, `training.ema=2000`.
+`--against OVERRIDE...` measures the same updates under these overrides, too: `compile=true`, `training.ema=2000`.
 """
 
 import argparse

@@ -194,7 +194,7 @@ def neighbours(count: int) -> Iterator[None]:
 
 
 def contest(programs: dict[str, Program], rounds: int, seconds: float, busy: int) -> dict[str, list[float]]:
-    """The rates of programs that all live at once and work in turns, beside busy neighbours."""
+    """The rates of programs that all live at once and work in turns, with busy neighbours."""
     with ExitStack() as stack:
         contestants = {name: stack.enter_context(Contestant(program)) for name, program in programs.items()}
         turns = {name: functools.partial(one.measure, seconds) for name, one in contestants.items()}

@@ -212,7 +212,7 @@ def test_a_game_is_compared_by_its_own_facts_and_without_its_plugin_by_none(
         page = (folder / "comparison.html").read_text()
         pages.append(re.sub(r"<[^>]*>", " ", page))
         tables.append({path.stem: path.read_text() for path in (folder / "tables").glob("*.csv")})
-    for words in ("human-normalised", "Beside other players"):
+    for words in ("human-normalised", "Against other players"):
         assert [words in page for page in pages] == [False, True]
     assert [table["references"].count("\n") for table in tables] == [0, 3]
     assert "random player,1.7" in tables[1]["references"]

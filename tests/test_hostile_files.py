@@ -62,7 +62,7 @@ READ_BY = {
     "card/weights.safetensors": ("exported",),
 }
 WAYS = ("deep", "pipe", "folder", "huge", "cut", "", "5", "[]", "{}", "null", '{"kind":"metrics"}', "\x00")
-OWN = ("lock", "holder.txt", "published.")  # beginnings of files that verbs may write beside a run's
+OWN = ("lock", "holder.txt", "published.")  # beginnings of files that verbs may write next to a run's
 
 
 class Hangs(BaseException): ...

@@ -77,7 +77,7 @@ def test_no_score_is_no_summary() -> None:
 
 @pytest.fixture
 def library(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """rliable's bootstrap, which needs that of arch alone: arch as a whole does not import beside pandas 3."""
+    """rliable's bootstrap, which needs that of arch alone: arch as a whole does not import with pandas 3."""
     spec = find_spec("arch")
     assert spec is not None
     arch = ModuleType("arch")

@@ -20,9 +20,9 @@ def _work(asked: Asked[Config]) -> Callable[[], None]:
     from atlantis_exp.sessions.contracts import check
 
     chosen = [text for text in asked.overrides if not text.startswith("phase")]
-    beside = [f"model={name}" for name in ("cnn", "resnet")]
+    references = [f"model={name}" for name in ("cnn", "resnet")]
     own = [text for text in asked.overrides if not text.startswith("model")]
-    others = [training_of([*own, text]) for text in beside if text not in asked.overrides]
+    others = [training_of([*own, text]) for text in references if text not in asked.overrides]
     return partial(check, job_of(asked), training_of(replaced(chosen, *_SMALL)), others)
 
 

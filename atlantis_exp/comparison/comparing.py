@@ -127,7 +127,7 @@ def compare(
             folder.write_config(facts)
             journal.params({key: str(value) for key, value in flatten(facts).items()})
             journal.tags({**made, "verdict": comparison.verdict})
-            journal.note("\n\n".join([comparison.verdict, *comparison.others, *comparison.beside, *comparison.notes]))
+            journal.note("\n\n".join([comparison.verdict, *comparison.others, *comparison.caveats, *comparison.notes]))
             journal.metrics(_metrics(comparison), 0)
             journal.artifact(_PAGE, page(comparison, figures, shown).encode())
             for name, figure in figures.items():
@@ -201,7 +201,7 @@ def _print(comparison: Comparison) -> None:
     console.print()
     for each in comparison.answers:
         console.print(f"By {each.family.name}: {spent(each)}.")
-    for sentence in comparison.beside:
+    for sentence in comparison.caveats:
         console.print(f"- {sentence}")
     for sentence in (*reversed(comparison.others), comparison.verdict):
         console.print(f"\n{sentence}")

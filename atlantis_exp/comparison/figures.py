@@ -117,7 +117,7 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
     if tables["references"]:
         drawn["references"] = _render(
             partial(_references, comparison=comparison),
-            "Beside other players",
+            "Against other players",
             "Mean scores of the groups among measured players and published algorithms"
             + (", on a logarithmic axis." if comparison.game.is_logarithmic else "."),
             height=1.0 + 0.24 * (len(groups) + len(tables["references"])),

@@ -246,7 +246,7 @@ def other_players(facts: Facts) -> Iterator[str]:
         yield why
 
 
-BESIDE: Sequence[Callable[[Facts], Iterator[str]]] = (
+CAVEATS: Sequence[Callable[[Facts], Iterator[str]]] = (
     collapsed,
     equal_within,
     equal_across,
@@ -259,7 +259,7 @@ BESIDE: Sequence[Callable[[Facts], Iterator[str]]] = (
     later_seeds,
     unplanned,
 )
-"""What is said beside the verdict, since it can make it mean something else."""
+"""What can make a verdict mean something else."""
 
 NOTES: Sequence[Callable[[Facts], Iterator[str]]] = (
     few_seeds,

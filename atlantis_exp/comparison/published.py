@@ -46,7 +46,7 @@ def curves(game: Component | None) -> Table:
 
 
 def _read(game: Component | None, name: str) -> Table:
-    if game is None or not (path := game.beside(name)).is_file():
+    if game is None or not (path := game.data_path(name)).is_file():
         return []
     table: Table = list(csv.DictReader(io.StringIO(read_file(path.resolve(), SMALL).decode())))
     for row in table:

@@ -11,7 +11,7 @@ from math import isnan
 import numpy as np
 
 from atlantis_exp.comparison.gather import AXES, Array, Gathered, Player, Training, plays_alike
-from atlantis_exp.comparison.notes import BESIDE, NOTES, Facts
+from atlantis_exp.comparison.notes import CAVEATS, NOTES, Facts
 from atlantis_exp.comparison.published import Row, Table, curves, scores
 from atlantis_exp.comparison.verdict import Answer, Question, answer, counted, families, group_of
 from atlantis_exp.comparison.words import said
@@ -37,7 +37,7 @@ class Comparison:
     answers: list[Answer]
     verdict: str  # the answer to what is asked first
     others: list[str]  # the answers to the rest of the question
-    beside: list[str]  # what can make a verdict mean something else
+    caveats: list[str]  # what can make a verdict mean something else
     notes: list[str]
     tables: dict[str, Table]
 
@@ -98,14 +98,14 @@ def compare(
         "skipped": [{"run": name, "reason": reason} for name, reason in gathered.skipped.items()],
     }
     facts = Facts(component, groups, question.by, answers, tables, float(frames))
-    beside, notes = ([line for note in notes for line in note(facts)] for notes in (BESIDE, NOTES))
+    caveats, notes = ([line for note in notes for line in note(facts)] for notes in (CAVEATS, NOTES))
     if now and answers and all(each.taken is None for each in answers):
-        beside.append("look=now took no look: no group that is undecided has new seeds, or one has fewer than five.")
+        caveats.append("look=now took no look: no group that is undecided has new seeds, or one has fewer than five.")
     if training := _in_training(tables["views"]):
         notes.insert(0, training)
     verdict, *others = _sentences(answers, list(groups))
     title = title_of(trainings[0].config["env.id"])
-    return Comparison(title, game, list(groups), list(question.by), answers, verdict, others, beside, notes, tables)
+    return Comparison(title, game, list(groups), list(question.by), answers, verdict, others, caveats, notes, tables)
 
 
 def to_csv(table: Table) -> str:
@@ -244,7 +244,7 @@ def _why(label: str, runs: Sequence[Training], sources: Sequence[str]) -> Row:
 
 
 def _modes(evaluation: Row, seeds: Mapping[int, float]) -> Table:
-    """One row where a group's seeds fall into two modes: how many survive, beside what those score."""
+    """One row where a group's seeds fall into two modes: how many survive, and what those score."""
     found = modes(list(seeds.values()))
     if found is None:
         return []

@@ -1,4 +1,4 @@
-"""Atlantis: all that the package knows of this game, with the files `atlantis_*` beside this one.
+"""Atlantis: all that the package knows of this game, with the files `atlantis_*` next to it.
 
 Three guns defend a city. A life, as ALE counts it, is a building that stands, guns included; it can rise again. A gun
 fires once a press, so that an action that is held fires once.

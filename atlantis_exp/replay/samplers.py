@@ -84,7 +84,7 @@ class PrioritizedSampler:
     likely 1. A new transition has the highest priority that any has had. Draws are stratified: one from each of
     `batch_size` equal parts of the sum of all priorities.
 
-    Beside the memory it takes 16 to 32 bytes for each observation that this may hold.
+    In addition to the memory it takes 16 to 32 bytes for each observation that this may hold.
     """
 
     def __init__(self, alpha: Probability, beta: Probability) -> None:

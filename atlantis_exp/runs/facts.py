@@ -1,4 +1,4 @@
-"""What a journal says of its run beside the points of its curves: tags and files."""
+"""What a journal says of its run apart from the points of its curves: tags and files."""
 
 import mmap
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Does a component keep what the rest relies on? Each promise tried on it, then what it costs beside ours."""
+"""Does a component keep what the rest relies on? Each promise tried on it, then what it costs, and what ours do."""
 
 import copy
 import random
@@ -43,8 +43,8 @@ _HEADS: dict[str, Head] = {
 _SECONDS = 1.0  # of a measurement
 
 
-def check(job: Job, small: Job, beside: Sequence[Job]) -> None:
-    """Try every contract on the components of a job, measure its network beside others', and print two tables.
+def check(job: Job, small: Job, references: Sequence[Job]) -> None:
+    """Try every contract on the components of a job, measure its network and the references', and print two tables.
 
     small: the same components in a training of seconds, which is killed and continued.
 
@@ -66,7 +66,7 @@ def check(job: Job, small: Job, beside: Sequence[Job]) -> None:
             table.add_row(part, contract, "BROKEN", kind + reason)
     terminal.console(least=120).print(table)
     with terminal.working("measuring what the networks cost"):
-        costs = _costs([job, *beside])
+        costs = _costs([job, *references])
     terminal.console(least=120).print(costs)
     if broken:
         raise Fault(f"broken: {', '.join(broken)}")

@@ -360,7 +360,7 @@ class _Session:
                 if new := {key: value for key, value in named.items() if (look.size, key) not in there}:
                     journal.metrics(new, look.size)
         journal.tags({"verdict": comparison.verdict})
-        lines = [comparison.verdict, *comparison.others, *comparison.beside, _looks(comparison)]
+        lines = [comparison.verdict, *comparison.others, *comparison.caveats, _looks(comparison)]
         commands = f"Continue or report: `{self.request.command}`\n\nIts runs again: `{self.comparing}`"
         journal.note("\n\n".join(line for line in (*lines, commands) if line))
         journal.flush()

@@ -96,7 +96,7 @@ def _both(config: Config, network: nn.Module, content: bytes) -> tuple[Values, V
 
     plain = Network("torch", "torch", config.env, ActionValues(network).q_values)
     other = replace(plain, run="ONNX Runtime", q_values=q_values)
-    if (game := config.env.game) is not None and (path := game.beside("states.npz")).is_file():
+    if (game := config.env.game) is not None and (path := game.data_path("states.npz")).is_file():
         archive = read_archive(path)
         return asked(plain, archive), asked(other, archive)
     size = (64, config.env.stack, config.env.size, config.env.size)

@@ -70,8 +70,8 @@ def probe_groups(outputs: Path, groups: Mapping[str, Sequence[Training]], baseli
 def _probe_groups(outputs: Path, groups: Mapping[str, Sequence[Training]], baseline: str | None, tell: Tell) -> Probed:
     notes: list[str] = []
     archive = None
-    if (game := next(iter(groups.values()))[0].game) is not None and game.beside("states.npz").is_file():
-        archive = read_archive(game.beside("states.npz"))
+    if (game := next(iter(groups.values()))[0].game) is not None and game.data_path("states.npz").is_file():
+        archive = read_archive(game.data_path("states.npz"))
     else:
         notes.append("There are no archived states of this game, so the networks were asked about none.")
     pairs = list(combinations(groups, 2))

@@ -90,7 +90,7 @@ class Session(Protocol):
 
 
 def start(command: Sequence[str], said: Path) -> Session:
-    """Start a command in a process group of its own; what it says on stderr goes to a file, the rest beside it."""
+    """Start a command in a process group of its own; stderr goes to the file `said`, stdout to one next to it."""
     with open(said, "wb") as errors, open(said.with_name(_SAYS), "wb") as lines:
         return subprocess.Popen(command, stdout=lines, stderr=errors, start_new_session=True)
 

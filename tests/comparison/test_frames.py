@@ -161,7 +161,7 @@ def test_a_baseline_is_a_run_without_curve_and_epsilon(recorded: Recorded, tmp_p
     loaded = load_runs(tmp_path)
     row = loaded.runs.set_index("run").loc[folder.name]
     assert (row["kind"], row["title"], row["agent.name"]) == ("baseline", "random player", "random")
-    assert row["env.frameskip"] == "4"  # beside lists of the others
+    assert row["env.frameskip"] == "4"  # a string: other runs have lists
     evaluation = loaded.evaluations.set_index("run").loc[folder.name]
     assert (evaluation["source"], evaluation["step"], evaluation["mean"]) == ("baseline", 0, 50)
     assert (evaluation["final"], evaluation["evaluation_seed"]) == (True, 3)

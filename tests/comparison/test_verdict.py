@@ -219,16 +219,16 @@ def test_unbalanced_groups_and_seeds_are_left_out_of_a_keys_answer_and_named() -
     assert model.left_out == ["cnn top_half", "resnet top_half"]
     assert sampler.left_out == ["tiny uniform"]
     assert list(sampler.seeds["top_half"]) == [0, 1, 2, 3]
-    beside = " ".join(comparison.beside)
-    assert "By model, some groups do not count, for not all values have their like: cnn top_half" in beside
-    assert "By sampler, top_half goes without seed 4, which not all of its groups have." in beside
+    caveats = " ".join(comparison.caveats)
+    assert "By model, some groups do not count, for not all values have their like: cnn top_half" in caveats
+    assert "By sampler, top_half goes without seed 4, which not all of its groups have." in caveats
 
 
 def test_keys_that_share_no_value_are_not_answered_by_themselves() -> None:
     runs = [*around("cnn", 3_000.0, sampler="uniform"), *around("resnet", 5_000.0, sampler="top_half")]
     comparison = compared(runs, "model", "sampler")
     assert [each.family.name for each in comparison.answers] == ["model,sampler"]
-    assert any(line.startswith("model is not answered by itself") for line in comparison.beside)
+    assert any(line.startswith("model is not answered by itself") for line in comparison.caveats)
     (each,) = comparison.answers
     assert each.family.plan.error == 0.05
 
@@ -284,7 +284,7 @@ def test_fewer_than_five_seeds_never_decide_not_even_when_asked_to_look_now() ->
         comparison = compared(runs, now=now)
         assert comparison.verdict == "Not decided: cnn against resnet; next look at 5 seeds (cnn has 4)."
         assert comparison.tables["looks"] == []
-    assert "look=now took no look" in comparison.beside[-1]
+    assert "look=now took no look" in comparison.caveats[-1]
     assert "cnn has 4 of the 5 seeds without which nothing is decided." in comparison.notes
 
 
@@ -314,7 +314,7 @@ def test_looks_are_taken_where_they_are_planned_and_the_same_seeds_charge_nothin
     assert "more seeds" not in between.verdict
     assert (
         "Verdicts rest on the seeds of their looks, scores are of all seeds there are: cnn has 7, resnet has 7."
-        in between.beside
+        in between.caveats
     )
 
     last = compared(runs(seeds), record=record_of(between))
@@ -337,7 +337,7 @@ def test_a_look_that_nobody_planned_is_charged_and_said() -> None:
     charged = 0.05 * (0.49 - 0.25)
     assert each.decision.looks[1].error == pytest.approx(charged)
     said = f"By model, a look was taken at 7 seeds, where none was planned: it spent {charged:.2%} of the error."
-    assert said in comparison.beside
+    assert said in comparison.caveats
     assert spent(each) == "looks planned at 5 and 10 seeds; taken: 5, 7; error spent: 2.45% of 5.00%"
     assert comparison.tables["plan"][0]["taken"] == "5 7"
 
@@ -397,7 +397,7 @@ def test_whoever_follows_what_is_said_to_the_end_is_seldom_told_a_difference_tha
     assert wrong / comparisons <= 0.05
 
 
-# What is said beside a verdict.
+# Caveats of a verdict.
 
 
 def test_collapsed_policies_are_named_and_equal_scores_count_as_one_seed() -> None:
@@ -412,10 +412,12 @@ def test_collapsed_policies_are_named_and_equal_scores_count_as_one_seed() -> No
     (each,) = comparison.answers
     assert list(each.family.seeds["cnn"]) == [0, 3, 4]
     assert comparison.verdict == "Not decided: cnn against resnet; next look at 5 seeds (cnn has 3)."
-    beside = " ".join(comparison.beside)
-    assert "3 of 5 runs of cnn collapsed to one action" in beside
-    assert "cnn-uniform-s1 has the same score in every episode as cnn-uniform-s0: the two count as one seed." in beside
-    assert "cnn and resnet have runs with the same score in every episode: cnn-uniform-s0, resnet-uniform-s0." in beside
+    caveats = " ".join(comparison.caveats)
+    assert "3 of 5 runs of cnn collapsed to one action" in caveats
+    assert "cnn-uniform-s1 has the same score in every episode as cnn-uniform-s0: the two count as one seed." in caveats
+    assert (
+        "cnn and resnet have runs with the same score in every episode: cnn-uniform-s0, resnet-uniform-s0." in caveats
+    )
     assert [row["same_as"] for row in comparison.tables["runs"]][:3] == ["", "cnn-uniform-s0", "cnn-uniform-s0"]
     assert comparison.tables["evaluation"][0]["runs"] == 3
 
@@ -429,7 +431,7 @@ def test_seeds_that_fall_into_modes_come_with_survival_and_points_per_frame() ->
     (evaluation, _) = comparison.tables["evaluation"]
     scores = np.concatenate([run.episodes.scores for run in runs[:6]])
     assert row["points_per_frame"] == evaluation["points_per_frame"] == pytest.approx(scores.mean() / 100)
-    assert any(line.startswith("cnn falls into two modes: 67% of its seeds score 5,005") for line in comparison.beside)
+    assert any(line.startswith("cnn falls into two modes: 67% of its seeds score 5,005") for line in comparison.caveats)
     assert "in the upper mode" in page(comparison, {}, {})
 
 
@@ -438,22 +440,22 @@ def test_runs_of_different_precisions_or_devices_are_named() -> None:
         *around("cnn", 3_000.0, tags={"precision": "bfloat16", "device": "cpu"}),
         *around("resnet", 5_000.0, tags={"precision": "float32", "device": "cpu"}),
     ]
-    beside = " ".join(compared(runs).beside)
-    assert "The runs were made in different precisions: bfloat16: cnn-uniform-s0, " in beside
-    assert "float32: resnet-uniform-s0" in beside
-    assert "devices" not in beside
+    caveats = " ".join(compared(runs).caveats)
+    assert "The runs were made in different precisions: bfloat16: cnn-uniform-s0, " in caveats
+    assert "float32: resnet-uniform-s0" in caveats
+    assert "devices" not in caveats
 
 
 def test_runs_that_were_not_trained_equally_long_are_named_unless_that_is_the_question() -> None:
     runs = [*around("cnn", 3_000.0), *around("resnet", 5_000.0)]
-    assert not any("equally long" in line for line in compared(runs).beside)
+    assert not any("equally long" in line for line in compared(runs).caveats)
     for run in runs[:5]:
         run.config["budget.steps"] = 4_000
     said = "The runs were not trained equally long: budget.steps=4,000: cnn-uniform-s0, "
     assert any(
-        line.startswith(said) and "; the whole plan: resnet-uniform-s0, " in line for line in compared(runs).beside
+        line.startswith(said) and "; the whole plan: resnet-uniform-s0, " in line for line in compared(runs).caveats
     )
-    assert not any("equally long" in line for line in compared(runs, "model", "budget.steps").beside)
+    assert not any("equally long" in line for line in compared(runs, "model", "budget.steps").caveats)
 
 
 def test_who_leads_while_training_is_said_as_a_description() -> None:

@@ -1,4 +1,4 @@
-"""What a journal says beside its points."""
+"""What a journal says apart from its points."""
 
 from pathlib import Path
 

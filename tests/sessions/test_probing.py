@@ -36,7 +36,7 @@ Compose = Callable[..., Config]
 PRETRAINED = Path(__file__).resolve().parents[2] / "pretrained"
 GAME = known("env")["atlantis"]
 ATLANTIS = facts_of(GAME)
-STATES = GAME.beside("states.npz")
+STATES = GAME.data_path("states.npz")
 
 
 @pytest.fixture(scope="module")
