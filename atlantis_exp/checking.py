@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
@@ -14,6 +15,8 @@ from pydantic_core import ErrorDetails
 from atlantis_exp.faults import ConfigError
 
 T = TypeVar("T")
+
+_LONGEST = 10 * 365 * 24 * 3600  # seconds
 
 
 def nearest(word: str, choices: Iterable[str]) -> str:
@@ -26,9 +29,29 @@ def nearest(word: str, choices: Iterable[str]) -> str:
 
 def seconds(text: str | int) -> int:
     """Return the seconds of a time such as 90, 90s, 10min, 3h or 1h30m, 0 where it is not readable."""
-    parts = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m(?:in)?)?(?:(\d+)s?)?", str(text))
+    if re.fullmatch(r"\d+", str(text)):
+        return int(text)
+    parts = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m(?:in)?)?(?:(\d+)s)?", str(text))
     hours, minutes, seconds = (int(part or 0) for part in parts.groups()) if parts else (0, 0, 0)
     return 3600 * hours + 60 * minutes + seconds
+
+
+def check_time(key: str, text: str | int | None, example: str) -> None:
+    """Raise ConfigError where a key holds no time, or one beyond what a clock can wait for."""
+    if text is None:
+        return
+    if not (length := seconds(text)):
+        raise ConfigError(f"{key}={text}: no time; write it as in {example}")
+    if length > _LONGEST:
+        raise ConfigError(f"{key}={text}: should be at most 10 years")
+
+
+def absolute(key: str, text: str) -> Path:
+    """A path that a person typed, `~` filled in. Raises: ConfigError."""
+    try:
+        return Path(text).expanduser().absolute()
+    except RuntimeError:
+        raise ConfigError(f"{key}={text}: there is no such user here, whose folder ~ would be") from None
 
 
 def check_server(key: str, uri: str | None) -> None:

@@ -22,7 +22,7 @@ from typing import Annotated, Any, Final, Literal
 
 from annotated_types import Interval
 
-from atlantis_exp.checking import nearest
+from atlantis_exp.checking import absolute, nearest
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.registry import Game
 from atlantis_exp.registry import component as component
@@ -309,7 +309,7 @@ def _sources(reference: str) -> list[Source]:
 
 
 def _file(reference: str) -> Source:
-    path = Path(reference).expanduser().absolute()
+    path = absolute("plugins", reference)
     if not re.fullmatch(r"[A-Za-z_]\w{0,79}", path.stem, re.ASCII) or path.suffix != ".py":
         raise ConfigError(f"plugins={reference}: write a file NAME.py, its name of letters, digits and underscores")
     text = _read(reference, path)
@@ -485,8 +485,8 @@ class _Reader:
         match node:
             case ast.Constant(value=None):
                 return None
-            case ast.Constant(value=str(text)):
-                return self._type(name, ast.parse(text, mode="eval").body)
+            case ast.Constant(value=str(text)) if (said := _expression(text)) is not None:
+                return self._type(name, said)
             case ast.Name(id=plain) if plain in _PLAIN:
                 return _PLAIN[plain]
             case ast.Name(id=alias) if alias in self._aliases:
@@ -540,6 +540,14 @@ def _is_plain(value: object) -> bool:
     if isinstance(value, tuple):
         return all(map(_is_plain, value))
     return value is None or isinstance(value, bool | int | float | str)
+
+
+def _expression(text: str) -> ast.expr | None:
+    """An annotation that is written as a string; None where it is no expression."""
+    try:
+        return ast.parse(text, mode="eval").body
+    except (SyntaxError, ValueError, MemoryError, RecursionError):
+        return None
 
 
 def _is_dots(node: ast.expr) -> bool:

@@ -18,7 +18,7 @@ from pydantic import AfterValidator, ConfigDict, Field, PlainValidator, TypeAdap
 from pydantic.dataclasses import dataclass
 from pydantic_core import PydanticKnownError
 
-from atlantis_exp.checking import check_server, digest, nearest, seconds, to_dict
+from atlantis_exp.checking import check_server, check_time, digest, nearest, seconds, to_dict
 from atlantis_exp.components import KINDS, NAME, Component, Plugin, game_ids, game_of, known, title_of
 from atlantis_exp.faults import ConfigError
 
@@ -40,7 +40,6 @@ Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$")]
 FREE = frozenset(("plugins", "resume", "device", "threads", "compile", "tracking", "budget", "paths"))
 """The keys that say how a run is done; of `plugins`, those that its components are of are part of what is trained."""
 
-_LONGEST = 10 * 365 * 24 * 3600  # seconds
 
 SCREEN = (210, 160)  # rows, columns of the emulator's screen
 
@@ -364,14 +363,11 @@ class BudgetConfig:
     forecast: Literal["refuse", "warn", "off"]
 
     def __post_init__(self) -> None:
-        if self.seconds == 0:
-            raise ConfigError(f"budget.wall_clock={self.wall_clock}: no time; write it as in 90s, 10min, 3h or 1h30m")
-        if self.seconds is not None and self.seconds > _LONGEST:
-            raise ConfigError(f"budget.wall_clock={self.wall_clock}: should be at most 10 years")
+        check_time("budget.wall_clock", self.wall_clock, "90s, 10min, 3h or 1h30m")
 
     @property
     def seconds(self) -> int | None:
-        """`wall_clock` in seconds, 0 where it is not readable."""
+        """`wall_clock` in seconds."""
         return None if self.wall_clock is None else seconds(self.wall_clock)
 
 

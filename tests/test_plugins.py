@@ -336,6 +336,12 @@ BROKEN = [  # what is in mynet.py instead of a part of it, the line that is to b
         "def __init__",
         r"width: np.ndarray is no type of a setting; write int, float",
     ),
+    (
+        "width: Width",
+        "width: 'a side of'",
+        "def __init__",
+        r"width: 'a side of' is no type of a setting",
+    ),
     ("width: Width = 8", "width=8", "def __init__", r"width: has no type"),
     ("width: Width = 8", "width: Width = 4 + 4", "def __init__", r"width: its value should be a number"),
     (
@@ -554,7 +560,7 @@ def test_the_page_does_what_it_says(
     monkeypatch.chdir(tmp_path)
     blocks = "".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL))
     (recipe,) = re.findall(r"^run: .*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), re.MULTILINE)
-    lines = blocks.replace("make run\n", recipe.replace("\t$(BIN)/", "")).splitlines()
+    lines = blocks.replace("make run\n", recipe.replace("\t$(BIN)/", "")).replace("\\\n", "").splitlines()
     place = f"paths.outputs={tmp_path / 'outputs'}"
     quick = replaced(tiny_overrides, "phase.quick.steps=20", "evaluation.every_steps=null", place)
     played = ("episodes=1", "evaluation.video=false", "evaluation.num_envs=1", "tracking=none", place)

@@ -50,6 +50,11 @@ def main() -> None:
 
         print(help_text(verb, arguments))
         sys.exit(0)
+    if "--version" in arguments:
+        from importlib.metadata import version
+
+        print(f"atlantis-exp {version('atlantis-exp')}")
+        sys.exit(0)
     try:
         importlib.import_module(f"atlantis_exp.commands.{verb.replace('-', '_')}").VERB.run(arguments)
     except KeyboardInterrupt:  # before there is anything to lose, or a verb would have said so

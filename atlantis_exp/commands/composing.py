@@ -20,7 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from atlantis_exp import components
-from atlantis_exp.checking import nearest, parse
+from atlantis_exp.checking import absolute, nearest, parse
 from atlantis_exp.commands import CHECKOUT, CONF
 from atlantis_exp.config import PINNED, record_plugins
 from atlantis_exp.faults import ConfigError
@@ -66,7 +66,7 @@ def checked(schema: type[T], composed: DictConfig) -> T:
         training["weights"] = pinned(training["weights"])
     paths = tree.get("paths")
     if isinstance(paths, dict) and isinstance(paths.get("outputs"), str) and paths["outputs"]:
-        paths["outputs"] = str(Path(paths["outputs"]).expanduser().absolute())
+        paths["outputs"] = str(absolute("paths.outputs", paths["outputs"]))
     return parse(schema, tree)
 
 

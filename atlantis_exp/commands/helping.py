@@ -11,10 +11,13 @@ _GROUP = re.compile(r" +- (?P<preset>override /)?(?P<group>[\w@.]+): (?P<option>
 _KEY = re.compile(r"(?P<indent> *)(?P<key>\w+):(?P<value>.*?)\s*(?:#(?P<comment>.*))?")
 _VALUES = 30  # columns of a key and its value, behind which its sentence begins
 
-_FLAGS = """\
+_SWEEP = """\
   -m                 a sweep over the keys that have several values, as in seed=0,1,2
+"""
+_FLAGS = """\
   --cfg job          print the config instead; --resolve fills in what refers to other keys
   --config-dir DIR   further options of groups, in files of your own
+  --version          of atlantis-exp
   --help"""
 
 
@@ -35,7 +38,7 @@ def help_text(verb: str, arguments: Sequence[str]) -> str:
         parts.append("\n".join(_of_group(group, chosen.get(group, option))))
     if plugins := _plugins():
         parts.append("\n".join(["== Plugins ==", *plugins]))
-    parts.append(f"== Flags ==\n{_FLAGS}")
+    parts.append(f"== Flags ==\n{'' if verb in ('decide', 'search') else _SWEEP}{_FLAGS}")
     parts.append("\n".join(["== Verbs ==", *(f"  {name:15}{purpose}" for name, purpose in VERBS.items())]))
     return "\n\n".join(parts)
 

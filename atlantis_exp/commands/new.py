@@ -3,12 +3,12 @@
 import re
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from atlantis_exp.checking import absolute
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.components import KINDS, NAME, built_in
 from atlantis_exp.config import STRICT
@@ -50,11 +50,11 @@ def _work(asked: Asked[NewConfig]) -> Callable[[], None]:
 
     config = asked.config
     if len(config.named) != 1:
-        raise ConfigError(f"new: name one component, as one of {', '.join(KINDS)}: model=mynet")
+        raise ConfigError(f"new: name one component, as one of {', '.join(_KINDS)}: model=mynet")
     ((kind, name),) = config.named.items()
     if config.to is None:
         raise ConfigError(f"to: missing; write to=FOLDER, as in to=./{name}")
-    return partial(begin, kind, name, Path(config.to).expanduser())
+    return partial(begin, kind, name, absolute("to", config.to))
 
 
 VERB = Verb("new", NewConfig, _work, rewrite=_spell_out)

@@ -18,7 +18,7 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
-from atlantis_exp.checking import flatten, nearest
+from atlantis_exp.checking import absolute, flatten, nearest
 from atlantis_exp.commands import CONF
 from atlantis_exp.commands.composing import admit, checked, composing
 from atlantis_exp.components import KINDS, admitted, installed
@@ -154,6 +154,9 @@ def _flags(arguments: Sequence[str]) -> argparse.Namespace:
         raise ConfigError(
             f"--{'cfg' if flags.cfg else 'info'} {shown}: shows one config; drop -m, and name one value a key"
         )
+    for flag in ("resolve", "package"):
+        if getattr(flags, flag) and not flags.cfg and not flags.info:
+            raise ConfigError(f"--{flag}: is about what is printed instead of the work; add --cfg job")
     for flag in ("config_path", "config_name", "experimental_rerun"):
         if getattr(flags, flag) is not None:
             raise ConfigError(f"--{flag.replace('_', '-')}: the verb decides on its config; write overrides instead")
@@ -256,7 +259,7 @@ def located(arguments: Sequence[str]) -> list[str]:
 def config_dir(arguments: Sequence[str]) -> Path | None:
     """The folder of a person's own options that a command line names. Raises: ConfigError."""
     folder = _flags(arguments).config_dir
-    return None if folder is None else Path(folder).expanduser().absolute()
+    return None if folder is None else absolute("--config-dir", folder)
 
 
 def _check_config_dir(folder: Path) -> None:
@@ -290,7 +293,7 @@ def _located(match: re.Match[str]) -> str:
     for text in match[1].removeprefix("[").removesuffix("]").split(","):
         reference = text.strip().strip("'\"")
         if "/" in reference or reference.endswith(".py"):
-            reference = str(Path(reference).expanduser().absolute())
+            reference = str(absolute("plugins", reference))
         references.append(reference if re.fullmatch(r"[\w/.+-]+", reference, re.ASCII) else f"'{reference}'")
     return f"plugins=[{','.join(references)}]"
 

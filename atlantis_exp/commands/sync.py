@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from atlantis_exp.checking import check_server, seconds
+from atlantis_exp.checking import check_server, check_time, seconds
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.config import STRICT, Count, PathsConfig, TrackingConfig
 from atlantis_exp.faults import ConfigError
@@ -30,12 +30,11 @@ class SyncConfig:
             raise ConfigError(f"from={self.from_}: goes the other way than to={self.to}; choose one")
         if self.tracking.name == "none":
             raise ConfigError("tracking=none: names no store to bring up to date; choose tracking=mlflow or server")
-        if self.seconds == 0:
-            raise ConfigError(f"every={self.every}: no time; write it as in 30s, 10min or 1h30m")
+        check_time("every", self.every, "30s, 10min or 1h30m")
 
     @property
     def seconds(self) -> int | None:
-        """`every` in seconds, 0 where it is not readable."""
+        """`every` in seconds."""
         return None if self.every is None else seconds(self.every)
 
 

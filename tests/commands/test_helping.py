@@ -3,13 +3,14 @@
 import re
 import subprocess
 import sys
+from importlib.metadata import version
 
 import pytest
 from hydra import compose
 from omegaconf import OmegaConf
 
 from atlantis_exp.checking import flatten
-from atlantis_exp.commands import CONF, VERBS
+from atlantis_exp.commands import CONF, VERBS, main
 from atlantis_exp.commands.composing import composing
 from atlantis_exp.commands.helping import help_text
 
@@ -58,3 +59,13 @@ def test_help_and_a_misspelt_verb_load_nothing_heavy() -> None:
     for words in (["--help"], ["compare", "--help"], ["trian"]):
         done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True, check=False)
         assert done.stderr.splitlines()[-1] == "[]", words
+
+
+def test_the_version_is_the_packages_and_a_plan_of_its_own_takes_no_sweep(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["atlantis_exp", "--version"])
+    with pytest.raises(SystemExit, match="0"):
+        main()
+    assert capsys.readouterr().out == f"atlantis-exp {version('atlantis-exp')}\n"
+    assert {verb for verb in VERBS if "\n  -m " not in help_text(verb, [])} == {"decide", "search"}

@@ -11,7 +11,7 @@ from atlantis_exp.commands.compare import CompareConfig
 from atlantis_exp.commands.evaluate import EvaluateConfig
 from atlantis_exp.commands.export import ExportConfig
 from atlantis_exp.commands.new import NewConfig
-from atlantis_exp.commands.overrides import check, refuse_twice
+from atlantis_exp.commands.overrides import check, located, refuse_twice
 from atlantis_exp.commands.play import PlayConfig
 from atlantis_exp.commands.query import QueryConfig
 from atlantis_exp.commands.report import ReportConfig
@@ -166,6 +166,12 @@ MISTAKES = [  # what is written, and what the one line must hold
             *("~hydra.launcher", "hydra.launcher={a:1}"),
         )
     ),
+    ("--resolve", "--resolve", "--cfg job"),
+    ("--package optimizer", "--package", "--cfg job"),
+    # folders of a user whom the machine does not know
+    ("paths.outputs='~nobodyhere/x'", "paths.outputs=~nobodyhere/x", "no such user"),
+    ("plugins=['~nobodyhere/mynet.py']", "plugins=~nobodyhere/mynet.py", "no such user"),
+    ("--config-dir=~nobodyhere/x", "--config-dir=~nobodyhere/x", "no such user"),
     # too much
     ("replay.capacity=1000000000000000000", "replay.capacity", "less than or equal to 1000000000"),
     (f"seed={'9' * 5_000}", "seed=999", "digits"),
@@ -218,6 +224,11 @@ def test_a_mistake_is_one_line_that_names_the_key_and_what_would_be_right(line: 
     assert key in message
     assert hint in message
     assert "\n" not in message
+
+
+def test_a_plugin_of_an_unknown_user_is_one_line_before_hydra_reads_it() -> None:
+    with pytest.raises(ConfigError, match=r"^plugins=~nobodyhere/mynet\.py: there is no such user"):
+        located(["plugins=~nobodyhere/mynet.py"])
 
 
 @pytest.mark.parametrize("line", ["seed=1 seed=2", "model=cnn model=resnet", "-m seed=0,1 seed=2", "seed=1 +seed=2"])

@@ -258,7 +258,7 @@ def test_a_time_is_read_in_the_usual_ways_and_is_no_part_of_the_identity(
     assert config.identity() == tiny().identity()
 
 
-@pytest.mark.parametrize("text", ["3x", "0", "h", "-3h", "'3 h'"])
+@pytest.mark.parametrize("text", ["3x", "0", "h", "-3h", "'3 h'", "1h30", "10m5"])
 def test_a_time_that_is_none_is_refused_in_one_line(tiny: Compose, text: str) -> None:
     with pytest.raises(ConfigError, match=r"budget\.wall_clock"):
         with_time(tiny(), text)
