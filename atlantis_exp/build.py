@@ -185,8 +185,8 @@ def needs(config: cfg.Config) -> str:
     return f"needs plugins={','.join(names)} ({'; '.join(lacking.values())}){''.join(given)}"
 
 
-def build_network(config: cfg.Config, name: str) -> nn.Module:
-    """A network with weights from the named stream; the global generator is as it was."""
+def build_network(config: cfg.Config, name: str, device: torch.device | None = None) -> nn.Module:
+    """A network on a device with weights from the named stream; the global generator is as it was."""
     if config.model.component is not None:
         config.model.component.load()  # what a module draws when it is imported is no part of the weights
     initial, dropout = stream(config.seed, name).generate_state(2, np.uint64)
@@ -194,6 +194,7 @@ def build_network(config: cfg.Config, name: str) -> nn.Module:
         torch.manual_seed(int(initial >> np.uint64(1)))
         network = _architecture(config)
         _check_output(config, network)
+    network.to(device)  # before the generator is made, which stays where it is
     seed_dropout(network, int(dropout >> np.uint64(1)))
     return network
 
@@ -226,8 +227,8 @@ def build_optimizer(optimizer: cfg.AdamConfig | cfg.RmsPropConfig, network: nn.M
 def build_learner(config: cfg.Config) -> Learner:
     """Both networks, the optimizer, the objective; sets torch's threads for this process, and keeps memory it frees."""
     device, target = choose_device(config.device), config.objective.target
-    network = build_network(config, "network").to(device)
-    target_network = build_network(config, "target").to(device)
+    network = build_network(config, "network", device)
+    target_network = build_network(config, "target", device)
     if target.start == "copy":
         target_network.load_state_dict(network.state_dict())
     return Learner(

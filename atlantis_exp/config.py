@@ -41,6 +41,7 @@ FREE = frozenset(("plugins", "resume", "device", "threads", "compile", "tracking
 """The keys that say how a run is done; of `plugins`, those that its components are of are part of what is trained."""
 
 
+_INDEX_BYTES = 23  # of the replay memory, an observation
 SCREEN = (210, 160)  # rows, columns of the emulator's screen
 
 
@@ -435,6 +436,13 @@ class Config:
             raise ConfigError(
                 f"training.learn_start={self.training.learn_start}: nothing would be learned, since the memory of "
                 f"replay.capacity={self.replay.capacity} holds no more transitions; need less than {most}"
+            )
+        frame = self.env.size**2
+        least = _INDEX_BYTES * self.replay.capacity + 9 * (frame + frame // 255 + 16)  # LZ4's bound for noise
+        if self.replay.max_bytes < least:
+            raise ConfigError(
+                f"replay.max_bytes={self.replay.max_bytes}: should be at least {least}, for the index of "
+                f"replay.capacity={self.replay.capacity} observations and nine that do not compress"
             )
         if not self.phase:
             raise ConfigError("phase: at least one phase is needed, as in conf/phase/single.yaml")

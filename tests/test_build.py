@@ -7,10 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
-from atlantis_exp.build import build_emulators, build_evaluator, build_learner
+from atlantis_exp import build
+from atlantis_exp.build import build_emulators, build_evaluator, build_learner, build_memory
 from atlantis_exp.config import Config
+from atlantis_exp.faults import ConfigError
 from atlantis_exp.game.vector import ProcessEmulators
+from atlantis_exp.replay.memory import ReplayMemory
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -31,6 +35,32 @@ def test_the_operations_of_an_update_are_those_counted_by_hand(tiny: Callable[..
     assert counted("env.size=84") == 4 * (sample + forward)
     assert counted("env.size=84", "objective=double_dqn") == 4 * (sample + 2 * forward)
     assert 4 * 1.8e9 < counted("model=resnet", "env.size=159") < 4 * 1.9e9
+
+
+@pytest.mark.parametrize(("capacity", "size"), [(120, 40), (70_000, 84)])
+def test_the_least_bytes_of_a_replay_memory_are_those_it_needs(
+    tiny: Callable[..., Config], capacity: int, size: int
+) -> None:
+    def config(most: int) -> Config:
+        return tiny(f"replay.capacity={capacity}", f"env.size={size}", f"replay.max_bytes={most}")
+
+    least = max(2**20, 23 * capacity + 9 * (size**2 + size**2 // 255 + 16))
+    build_memory(config(least))
+    if least > 2**20:
+        with pytest.raises(ConfigError, match=rf"^replay.max_bytes={least - 1}: should be at least {least}, for the"):
+            config(least - 1)
+        with pytest.raises(ValueError, match="does not hold"):
+            ReplayMemory(capacity, (size, size), budget_bytes=least - 1)
+
+
+def test_dropout_draws_on_the_device_where_its_network_is(
+    tiny: Callable[..., Config], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeded: list[str] = []
+    monkeypatch.setattr(build, "seed_dropout", lambda network, _: seeded.append(next(network.parameters()).device.type))
+    for device in (None, torch.device("meta")):
+        build.build_network(tiny("model=resnet"), "network", device)
+    assert seeded == ["cpu", "meta"]
 
 
 def test_a_network_plays_without_what_it_was_learned_by() -> None:

@@ -87,16 +87,16 @@ class Verb(Generic[T]):
                 self.work(Asked(config, self.name, overrides, _job_launcher(), typed))()
             except (Fault, OSError) as error:
                 # In a sweep an exit would take the other jobs along, an exception does not.
-                if HydraConfig.get().mode is RunMode.MULTIRUN:
+                if is_sweep():
                     raise
                 exit_with(error)
 
         sys.argv[1:] = arguments  # which Hydra reads
         os.environ.setdefault("HYDRA_FULL_ERROR", "1")
         asked = [Asked(config, self.name, (*flags, *overrides)) for overrides, config in jobs.items()]
-        is_sweep = len(asked) > 1 or not chosen.is_basic
+        is_one = len(asked) == 1 and chosen.is_basic
         try:
-            with self.sweep(asked, chosen, arguments) if is_sweep else nullcontext():
+            with nullcontext() if is_one else self.sweep(asked, chosen, arguments):
                 task()
         except (Fault, OSError) as error:
             exit_with(error)
@@ -108,11 +108,16 @@ def exit_with(error: Exception) -> NoReturn:
     sys.exit(getattr(error, "exit_code", 1))
 
 
+def is_sweep() -> bool:
+    """Whether Hydra runs this job as one of several."""
+    return HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN
+
+
 def _job_launcher() -> str | None:
     """The launcher that this process does one job of a sweep for; None where that is Hydra's own, or there is none."""
     if (apart := job_apart()) is not None:
         return apart
-    if HydraConfig.get().mode is not RunMode.MULTIRUN:
+    if not is_sweep():
         return None
     name = str(HydraConfig.get().runtime.choices["hydra/launcher"])
     return None if Launcher(name).is_basic else name

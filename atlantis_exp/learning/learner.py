@@ -77,6 +77,7 @@ class Learner(ActionValues):
         )
         self.target_mode = target_mode
         self.updates = 0
+        self._has_begun_with = False  # weights that were given, which the average holds, too
         self._sums = torch.zeros(len(_MEASURES), device=self.device)
         self._measured = 0  # updates in the sums
         self._first_nonfinite = torch.full((), -1, device=self.device)
@@ -87,6 +88,7 @@ class Learner(ActionValues):
             network.load_state_dict(weights)
         for replicas in (self._online, self._target, self._evaluated):
             replicas.refresh()
+        self._has_begun_with = True
 
     def update(
         self,
@@ -120,8 +122,9 @@ class Learner(ActionValues):
             _follow(self.target, self.network, self.tau, buffers=self.target_mode == "eval")
             self._target.refresh()
         if self.ema and self.updates % _AVERAGE_EVERY == 0:
-            # A plain mean of all weights so far, until there are as many as are asked for.
-            share = max(_AVERAGE_EVERY / self.updates, _AVERAGE_EVERY / self.ema)
+            # From random weights, a plain mean of all so far, until there are as many as are asked for.
+            first = 0.0 if self._has_begun_with else _AVERAGE_EVERY / self.updates
+            share = max(first, _AVERAGE_EVERY / self.ema)
             _follow(self.evaluated, self.network, share, buffers=True)
             self._evaluated.refresh()
         return torch.cat(errors)
@@ -190,7 +193,7 @@ class Learner(ActionValues):
         passes = self._online_passes, self._target_passes
         # The counter sees neither other threads nor compiled networks.
         self._online_passes, self._target_passes = self._online.networks, self._target.networks
-        states, zeros = np.zeros((2, *state), np.uint8), np.zeros(2)
+        states, zeros = np.zeros((2, *state), np.uint8), np.zeros(2, np.float32)
         with self.restored(), FlopCounterMode(display=False) as counter:
             self._gradients(2, 0, states, np.zeros(2, np.int64), zeros, states, zeros, zeros)
         self._online_passes, self._target_passes = passes
@@ -231,6 +234,7 @@ class Learner(ActionValues):
             "measured": self._measured,
             "first_nonfinite": self._first_nonfinite,
             **({"evaluated": self.evaluated.state_dict()} if self.ema else {}),
+            **({"has_begun_with": True} if self._has_begun_with else {}),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -248,6 +252,7 @@ class Learner(ActionValues):
         for name, generator in self._generators().items():
             generator.set_state(state["generators"][name].cpu())
         self.updates = state["updates"]
+        self._has_begun_with = state.get("has_begun_with", False)
         self._sums.copy_(state["sums"])
         self._measured = state["measured"]
         self._first_nonfinite.copy_(state["first_nonfinite"])

@@ -32,8 +32,7 @@ def schema_of(kind: type[T]) -> TypeAdapter[T]:
 def open_file(path: Path) -> BinaryIO:
     """Open a regular file for reading. Raises: OSError, ValueError where it is of another kind."""
     try:
-        # Without blocking: a pipe would wait until somebody writes to it.
-        file = open(path, "rb", opener=lambda name, flags: no_link(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+        file = open(path, "rb", opener=no_link)  # noqa: SIM115
     except OSError as error:
         if error.errno == errno.ELOOP:
             raise ValueError(f"{path} is no regular file, but a link") from None
@@ -53,8 +52,11 @@ def read_file(path: Path, most: int) -> bytes:
 
 
 def no_link(path: str, flags: int) -> int:
-    """Open a file that is no symbolic link, as `opener` of `open`. Raises: OSError."""
-    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
+    """Open a file that is no symbolic link, as `opener` of `open`. Raises: OSError.
+
+    A pipe does not block: it would wait until somebody comes to its other end.
+    """
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
 
 
 def inside(folder: Path, path: str) -> Path:

@@ -162,11 +162,12 @@ class RunFolder:
         """How far the run is; one whose process was killed is interrupted, whatever its journal says."""
         if not self.has_started:
             return "failed" if self.status == "FAILED" else "queued"
-        if self.result is not None:
-            return "done"
-        if self.status == "FAILED":
+        status = self.status
+        if status == "FAILED":
             return "failed"
-        has_ended = self.status not in (None, "SCHEDULED", "RUNNING")
+        if self.result is not None and status not in ("RUNNING", "KILLED"):  # which a run is that was made longer
+            return "done"
+        has_ended = status not in (None, "SCHEDULED", "RUNNING")
         return "running" if not has_ended and self.is_held else "interrupted"
 
     @property

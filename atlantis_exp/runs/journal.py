@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, Protocol, get_args
 from uuid import uuid4
@@ -23,6 +24,7 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import SMALL, inside, no_link, open_file, read_file, read_object, schema_of, write_file
 
 Status = Literal["SCHEDULED", "RUNNING", "FINISHED", "FAILED", "KILLED"]
+NOTE_LENGTH = 7_900  # characters; MLflow cuts a description at 8,000 without a word
 NOTE = "mlflow.note.content"
 """The tag that MLflow shows as markdown at the top of a run's page."""
 
@@ -324,6 +326,16 @@ def adopt(folder: Path, parent: Path) -> None:
     adopted = replace(commit, parent=os.path.relpath(parent, folder))
     if adopted != commit:
         _write_commit(folder, adopted)
+
+
+def fitted(lines: Sequence[str], room: int, rest: str) -> str:
+    """Returns as many lines as have room, in characters, in a note, and after them how many more are in `rest`."""
+    text = "\n".join(lines)
+    if len(text) <= room:
+        return text
+    more = f"\n\n... and {{:,}} more in {rest}."
+    kept = sum(end <= room - len(more) - 5 for end in accumulate(len(line) + 1 for line in lines))
+    return "\n".join(lines[:kept]) + more.format(len(lines) - kept)
 
 
 def restore(folder: Path, start: int, pieces: Iterable[bytes]) -> None:

@@ -1,5 +1,6 @@
 """Who holds a folder: one process at a time, until it ends, however it does."""
 
+import fcntl
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,6 +9,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from atlantis_exp.faults import Fault
+from atlantis_exp.runs.files import SMALL, no_link, open_file, read_file
 
 _HOLDER = "holder.txt"  # not the lock itself, which is emptied by whoever asks for it
 
@@ -25,11 +27,18 @@ def held(folder: Path, name: str, seconds: float) -> Iterator[None]:
     try:
         lock = FileLock(folder / "lock").acquire(seconds)
     except Timeout:
-        holder = (folder / _HOLDER).read_text() if (folder / _HOLDER).exists() else "another process"
-        raise Fault(f"{name} is held by {holder.strip()}", exit_code=75) from None
+        raise Fault(f"{name} is held by {_holder(folder)}", exit_code=75) from None
     with lock:
-        (folder / _HOLDER).write_text(f"process {os.getpid()} on {os.uname().nodename}\n")
+        with open(folder / _HOLDER, "w", opener=no_link) as file:
+            file.write(f"process {os.getpid()} on {os.uname().nodename}\n")
         yield
+
+
+def _holder(folder: Path) -> str:
+    try:
+        return read_file(folder / _HOLDER, SMALL).decode().strip()
+    except (OSError, ValueError):
+        return "another process"
 
 
 def _link(folder: Path) -> Path | None:
@@ -39,13 +48,14 @@ def _link(folder: Path) -> Path | None:
 
 
 def is_held(folder: Path) -> bool:
-    """Whether a process holds a folder."""
-    if not (folder / "lock").exists():
-        return False
+    """Whether a process holds a folder, which may be one that is only to be read. Raises: OSError."""
     try:
-        with FileLock(folder / "lock").acquire(blocking=False):
+        with open_file(folder / "lock") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # until it is closed
             return False
-    except Timeout:
+    except (FileNotFoundError, ValueError):
+        return False
+    except BlockingIOError:
         return True
 
 

@@ -64,7 +64,7 @@ def decide(request: Request) -> None:
     """
     session = _Session.of(request)
     outputs = session.outputs
-    catch_up(outputs)
+    catch_up(outputs, session.tracking.uri)
     shown = labels(f"decide {' '.join(request.several)}", run_colour("decide"), "decision")
     with session.folder.held(), terminable(), publishing(session.folder, session.tracking, outputs, shown) as journal:
         try:

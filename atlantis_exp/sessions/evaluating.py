@@ -51,7 +51,7 @@ def evaluate(
     An exported network plays by the protocol of its card, as far as no key in `asked` says otherwise.
     """
     outputs = Path(paths.outputs)
-    catch_up(outputs)
+    catch_up(outputs, tracking.uri)
     card = None
     if weights in STORED:
         folder = find_run(outputs, run)
@@ -98,7 +98,7 @@ def play_baseline(
 ) -> None:
     """Let a player without a network play, print the report's table, and record it all as the run `name`."""
     outputs = Path(paths.outputs)
-    catch_up(outputs)
+    catch_up(outputs, tracking.uri)
     facts = {
         **({"plugins": {key: to_dict(each) for key, each in plugins.items()}} if plugins else {}),
         "agent": to_dict(agent),
@@ -127,7 +127,7 @@ def play(
     The game runs at its 60 frames a second; picture and keys follow its steps, as for the networks.
     """
     outputs = Path(paths.outputs)
-    catch_up(outputs)
+    catch_up(outputs, tracking.uri)
     low, high = (env.frameskip, env.frameskip + 1) if isinstance(env.frameskip, int) else env.frameskip
     game, progress = facts_of(env.game), Progress()
     progress.say(f"{player} plays {env.title}: {game.keys_in_words}")

@@ -17,6 +17,8 @@ from atlantis_exp.sessions.weights import stored_weights
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.training.progress import Progress
 
+_COUNTERS = ("throughput/episodes", "throughput/frames", "learning/updates", "throughput/hours")
+
 
 def export(
     *,
@@ -37,7 +39,7 @@ def export(
     catch_up(outputs)
     source = find_run(outputs, run)
     folder = Path(to or f"pretrained/{source.name}")
-    if folder.is_dir() and any(folder.iterdir()):
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(f"to={folder}: is not empty; name another folder")
     trained = portable(source.trained_config)
     stored, step = stored_weights(source, weights)
@@ -79,9 +81,8 @@ def _history(run: RunFolder, step: int) -> tuple[dict[str, float], dict[str, str
     for record in run.records():
         if isinstance(record, Tags):
             tags |= record.values
-        elif isinstance(record, Metrics) and "throughput/frames" in record.values and record.step <= step:
-            counters = ("throughput/episodes", "throughput/frames", "learning/updates", "throughput/hours")
-            reached = {name.split("/")[1]: record.values[name] for name in counters}
+        elif isinstance(record, Metrics) and record.values.keys() >= {*_COUNTERS} and record.step <= step:
+            reached = {name.split("/")[1]: record.values[name] for name in _COUNTERS}
     made = {key: value for key, value in tags.items() if key == "command" or key.startswith(("git.", "version."))}
     if "command" in made:  # without the places of this machine
         made["command"] = re.sub(r" (paths|tracking)\.\S+", "", made["command"])

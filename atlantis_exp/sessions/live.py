@@ -32,11 +32,9 @@ class _Run:
     _updated: int = 0  # ms since 1970
 
     def look(self) -> None:
-        if self.state == "done":
-            return
         self.state = self.folder.state
         commit = read_commit(self.folder.path)
-        if commit is None:
+        if commit is None or (commit.identity, commit.offset) == (self._identity, self._offset):
             return
         if commit.identity != self._identity:
             self._identity, self._offset = commit.identity, 0

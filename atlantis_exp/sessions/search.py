@@ -35,7 +35,7 @@ from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
 from atlantis_exp.runs.files import ARTIFACT, read_file
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import Journal, Metrics, adopt, read
+from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Metrics, adopt, fitted
 from atlantis_exp.runs.lock import alone
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.job import Job, command_line, labels
@@ -221,7 +221,7 @@ class _Session:
         watch = _Watch(trial, stop, set(self.trials[trial.number].intermediate_values), self.folder.name)
         score, error = None, ""
         try:
-            score = self._score(trial, overrides, watch)
+            score = self._score(trial, overrides, watch, stop)
         except Fault as fault:
             if isinstance(fault.__cause__, OSError):
                 raise  # of the machine: no trial would fare better
@@ -240,7 +240,7 @@ class _Session:
             return
         self._print(trial.number)
 
-    def _score(self, trial: Trial, overrides: Sequence[str], watch: "_Watch") -> float | None:
+    def _score(self, trial: Trial, overrides: Sequence[str], watch: "_Watch", stop: StopRequest) -> float | None:
         """Train a trial's run; the mean of its last evaluation, None where `watch` has ended it.
 
         The mean is what all tables compare. Of the last evaluation, not of the best: the best of many is the luckiest.
@@ -259,7 +259,8 @@ class _Session:
         trial.set_user_attr("run", run.name)
         with suppress(Fault), run.held():  # what runs elsewhere stays where it is
             adopt(run.path, self.folder.path)
-        train(dataclasses.replace(job, config=config), watch)
+        if (late := train(dataclasses.replace(job, config=config), watch)) is not None:
+            stop.signal = late  # it came when the run had nothing left to stop
         if watch.pruned or watch.stopped:
             return None
         result = run.result
@@ -375,7 +376,7 @@ class _Page:
 
     def _write(self, journal: Journal) -> None:
         session = self._session
-        told = {record.step for _, record in read(session.folder.path) if isinstance(record, Metrics)}
+        told = {record.step for record in session.folder.records() if isinstance(record, Metrics)}
         ranking = session.ranking
         for trial in sorted(ranking, key=lambda trial: trial.number):
             if trial.number not in told:
@@ -388,9 +389,10 @@ class _Page:
         parts = [
             f"{session.counts()}. Continue, or help along from another terminal: `{session.request.command}`",
             f"The best in full: `{session.best_command()}`" if ranking else "",
-            "\n".join(["| trial | values | result | run |", "| ---: | --- | --- | --- |", *rows]),
         ]
-        journal.note("\n\n".join(part for part in parts if part))
+        above = "\n\n".join(part for part in parts if part)
+        table = ["| trial | values | result | run |", "| ---: | --- | --- | --- |", *rows]
+        journal.note(f"{above}\n\n{fitted(table, NOTE_LENGTH - len(above), '`trials.jsonl`')}")
         if len(ranking) > max(1, self._drawn):
             self._drawn = len(ranking)
             for name, picture in _draw(session.study).items():

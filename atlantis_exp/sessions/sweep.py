@@ -17,7 +17,7 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.media import curves, strips
 from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.runs.folder import TRACEBACK, RunFolder, State
-from atlantis_exp.runs.journal import Journal, Status, adopt, curve
+from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, adopt, curve, fitted
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.launchers import BASIC, Launcher, joblib, ray, slurm
@@ -84,7 +84,7 @@ def _page(
     name = f"sweep {' '.join(swept)}"
     shown = {"mlflow.runName": name, "atlantis.kind": "training sweep"}
     if not launcher.is_basic:
-        catch_up(outputs)  # the jobs do not
+        catch_up(outputs, jobs[0].config.tracking.uri)  # the jobs do not
     others = () if launcher.is_basic else folders
     with sweep.held(), terminable():
         for folder in folders:
@@ -129,7 +129,7 @@ def _launched(
         return
     match launcher.name:
         case "joblib":
-            context: AbstractContextManager[None] = joblib.jobs(journal, folders, close_page, launcher)
+            context: AbstractContextManager[None] = joblib.jobs(journal, jobs, close_page, launcher)
         case "ray":
             context = ray.jobs(journal, folders, close_page, launcher)
         case "slurm":
@@ -152,7 +152,7 @@ def _every(seconds: float, look: Callable[[], None]) -> Iterator[Callable[[], No
 
     def run() -> None:
         while not closing.wait(seconds):
-            with suppress(OSError, Fault):  # the next look may fare better
+            with suppress(OSError, ValueError, Fault):  # the next look may fare better
                 look()
 
     def close() -> None:
@@ -208,14 +208,19 @@ def _describe(journal: Journal, jobs: Sequence[Job], folders: Sequence[RunFolder
         lines.append(f"| {' | '.join(row + [''] * (len(head) - len(row)))} |")
         if folder.state == "failed":
             told = f" (`{TRACEBACK}` of the run tells all)" if (folder.path / TRACEBACK).exists() else ""
-            failures.append(f"**{job.title} failed**: {folder.error}{told}")
+            failures.append(f"- **{job.title} failed**: {folder.error}{told}")
     groups = [
         f"| {name} | {len(means)} | {np.mean(means):,.0f} | {min(means):,.0f} | {max(means):,.0f} |"
         for name, (_, means) in _evaluations(jobs, folders).items()
     ]
     summary = ["| group | runs | mean of the means | lowest | highest |\n| --- | ---: | ---: | ---: | ---: |", *groups]
-    parts = ["\n".join(lines), *failures, "\n".join(summary) if groups else "", "Figures: `curves.png`, `scores.png`."]
-    journal.note("\n\n".join(part for part in parts if part))
+    parts = [
+        fitted(summary, NOTE_LENGTH // 4, "`runs.csv`") if groups else "",
+        fitted(failures, NOTE_LENGTH // 4, "`runs.csv`"),
+        "Figures: `curves.png`, `scores.png`.",
+    ]
+    above = "\n\n".join(part for part in parts if part)
+    journal.note(f"{above}\n\n{fitted(lines, NOTE_LENGTH - len(above), '`runs.csv`')}")
     journal.flush()
 
 

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+from atlantis_exp import terminal
 from atlantis_exp.config import PathsConfig, TrackingConfig
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import COMMIT, RunFolder, all_folders
@@ -87,7 +88,9 @@ def _publish_all(outputs: Path, store: Store, only_brought: bool) -> Iterator[Lo
             if only_brought and brought(folder) is None:
                 continue
             forget_lost(folder, store, listed)
-            yield Look("published" if publish(folder, store, is_primary=False) else "up to date", run)
+            with terminal.working(f"publishing {run}"):
+                was_behind = publish(folder, store, is_primary=False)
+            yield Look("published" if was_behind else "up to date", run)
         except Exception as error:
             yield Look("failed", run, _reason(error, store))
 
@@ -101,7 +104,8 @@ def _bring_all(outputs: Path, source: Store) -> Iterator[Look]:
             if is_here(folder, run):
                 yield Look("as here", run.name)
                 continue
-            with _gone_unless_brought(folder), RunFolder(folder).held():
+            told = terminal.working(f"bringing {folder.relative_to(outputs)}")
+            with told, _gone_unless_brought(folder), RunFolder(folder).held():
                 outcome = bring(run, folder, source, listed)
             reason = f"{folder} is another run, which stays" if outcome == "other" else ""
             yield Look(outcome, str(folder.relative_to(outputs)), reason)
@@ -113,7 +117,8 @@ def _bring_all(outputs: Path, source: Store) -> Iterator[Look]:
 
 def _runs(store: Store) -> list[StoredRun]:
     try:
-        return store.runs()
+        with terminal.working(f"asking {store.uri} for its runs"):
+            return store.runs()
     except Exception as error:
         raise Fault(f"{store.uri} cannot be reached: {_first_line(error)}") from None
 

@@ -1,6 +1,7 @@
 """A training as a session: opened, run, closed; the same job again continues it, or reports how it has ended."""
 
 import dataclasses
+import os
 import signal
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -15,6 +16,7 @@ from atlantis_exp.build import build_trained_network, build_trainer, choose_devi
 from atlantis_exp.checking import flatten, to_dict
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault, RunFault
+from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import CONFIG, LOST, TRACEBACK, Result, RunFolder, all_runs
 from atlantis_exp.runs.journal import Journal, adopt
 from atlantis_exp.runs.provenance import provenance
@@ -75,13 +77,14 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
     """Whether there is nothing to train, which is then said; puts a run aside that is to be started over."""
     config = job.config
     if job.launcher is None:
-        catch_up(job.outputs, folder.path if folder.result is None else None)
+        catch_up(job.outputs, config.tracking.uri, folder.path if folder.result is None else None)
     if not sweep_goes_on(folder, job.launcher)():
         raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
     if config.resume == "must" and not folder.has_started:
         raise ConfigError(f"resume=must: there is no run {folder.name} under {job.outputs / 'runs'}")
     parent = folder.parent
-    if config.resume == "never" and folder.has_started:
+    # Slurm's next try of a job is no new run.
+    if config.resume == "never" and folder.has_started and os.environ.get("SLURM_RESTART_COUNT", "0") == "0":
         kept = next(
             path for n in range(1, 10_000) if not (path := folder.path.with_name(f"{folder.name}~{n}")).exists()
         )
@@ -203,7 +206,7 @@ def _faults_recorded(job: Job, folder: RunFolder, journal: Journal) -> Iterator[
         yield
     except BaseException as error:
         with suppress(OSError):  # a full disk takes no status either; the next command sees that nobody holds it
-            (folder.path / TRACEBACK).write_text(traceback.format_exc())
+            write_file(folder.path / TRACEBACK, traceback.format_exc().encode())
             journal.status("FAILED", str(error) or type(error).__name__)
         if isinstance(error, RunFault | OSError):
             raise Fault(f"run {folder.name}: {error}; continue with: {job.command}") from error

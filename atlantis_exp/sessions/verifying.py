@@ -112,19 +112,21 @@ def run_and_kill(start: Callable[[Path], Session], outputs: Path, runs: str, kil
     while True:
         before = generations(outputs, runs)
         session = start(outputs / _SAID)
-        while struck < kills and session.poll() is None:
-            time.sleep(0.01)
-            if generations(outputs, runs) > before:
-                time.sleep(random.random() * seconds)
-                with suppress(ProcessLookupError):  # it has just ended
-                    os.killpg(session.pid, signal.SIGKILL)
-                struck += session.wait() == -signal.SIGKILL
-                break
-        else:
-            if session.wait():
-                error = (outputs / _SAID).read_text().strip().splitlines()
-                raise Fault(f"a session under {outputs} failed: {error[-1] if error else 'it said nothing'}")
-            return struck
+        try:
+            while struck < kills and session.poll() is None:
+                time.sleep(0.01)
+                if generations(outputs, runs) > before:
+                    time.sleep(random.random() * seconds)
+                    break
+            else:
+                if session.wait():
+                    error = (outputs / _SAID).read_text().strip().splitlines()
+                    raise Fault(f"a session under {outputs} failed: {error[-1] if error else 'it said nothing'}")
+                return struck
+        finally:  # also where a signal ends this process: the session, in a group of its own, has not heard it
+            with suppress(ProcessLookupError):  # it has just ended
+                os.killpg(session.pid, signal.SIGKILL)
+        struck += session.wait() == -signal.SIGKILL
 
 
 def fingerprints(config: Config, outputs: Path) -> dict[str, str]:

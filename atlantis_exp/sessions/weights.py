@@ -5,7 +5,7 @@ import safetensors.torch
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import ARTIFACT, is_whole, read_file
 from atlantis_exp.runs.folder import NETWORK, RunFolder
-from atlantis_exp.runs.journal import Model, model_file, read
+from atlantis_exp.runs.journal import Model, model_file
 from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints, unforged
 
 
@@ -22,7 +22,7 @@ def stored_weights(run: RunFolder, weights: str) -> tuple[bytes, int]:
     except CheckpointError as error:
         raise Fault(f"run {run.name}: {error}") from error
     if state is None:
-        models = [record for _, record in read(run.path) if isinstance(record, Model)]
+        models = [record for record in run.records() if isinstance(record, Model)]
         stored = [model for model in models if weights == "latest" or model.best]
         if not stored:
             raise Fault(f"run {run.name} has neither a checkpoint nor an evaluation yet")

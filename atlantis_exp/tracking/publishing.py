@@ -1,6 +1,8 @@
 """Run folders and the store while a command works: mirrored as they grow, and what earlier commands left is sent."""
 
+import os
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -49,29 +51,38 @@ def publishing(
             )
 
 
-def catch_up(outputs: Path, continued: Path | None = None) -> None:
+def catch_up(outputs: Path, server: str | None = None, continued: Path | None = None) -> None:
     """Mark runs whose process died as interrupted; publish what earlier commands could not.
 
-    Not published is the run in the folder `continued`, whose own session will do so.
+    A folder's word for a server is not enough, since it would be sent the user's password: only the command's own
+    `server` is sent to, and the one that MLFLOW_TRACKING_URI names. Not published is the run in the folder `continued`,
+    whose own session will do so.
     """
+    named = {server, os.environ.get("MLFLOW_TRACKING_URI")}
+    left: Counter[str] = Counter()
     unreachable: set[str] = set()
     for folder in all_folders(outputs):
         try:
             runs_here = folder.status == "RUNNING" and not brought(folder.path)
             if runs_here and not folder.is_held:
-                with suppress(Fault), folder.held():
+                with suppress(Fault, OSError), folder.held():  # a folder of somebody else's may be read alone
                     Journal(folder.path).status("KILLED")
                     print(f"run {folder.name} was killed; the command that started it continues it")
             is_sent = folder.status == "RUNNING" or folder.path == continued
             store = None if is_sent else unfinished(folder.path, outputs)
-        except Fault as fault:
-            print(f"atlantis_exp: {fault}", file=sys.stderr)  # no reason to refuse a command for another run
+        except (Fault, OSError) as error:
+            print(f"atlantis_exp: {error}", file=sys.stderr)  # no reason to refuse a command for another run
             continue
         if store is None or store.address in unreachable:
+            continue
+        if not store.is_local and store.uri not in named:
+            left[store.uri] += 1
             continue
         with terminal.working(f"publishing {folder.name}, which an earlier command could not"):
             if not Publisher(folder.path, store).drain(_DRAIN_SECONDS):
                 unreachable.add(store.address)
+    for uri, runs in left.items():
+        print(f"atlantis_exp: {uri} lacks parts of {runs} runs; {PROGRAM} sync to={uri} sends them", file=sys.stderr)
 
 
 def how_to_open(outputs: Path) -> str:

@@ -55,6 +55,9 @@ P = TypeVar("P")
 
 _log = logging.getLogger(__name__)
 
+PLACE = r"([a-z]+)/[A-Za-z0-9][A-Za-z0-9_.,~+=@-]{0,199}"
+"""What a run's folder is called under an outputs folder."""
+
 DATABASE = "mlflow.db"
 """The local store, in an outputs folder."""
 
@@ -178,6 +181,17 @@ class Store:
         tags = {"atlantis.identity": commit.identity, "atlantis.folder": str(folder), **commit.labels}
         name = commit.labels.get(_RUN_NAME, folder.name)
         return str(self.client.create_run(self.experiment_id, commit.started, tags, name).info.run_id)
+
+    def has_run(self, run_id: str) -> bool:
+        """Returns whether a run is there and was not deleted."""
+        from mlflow.exceptions import MlflowException
+
+        try:
+            return bool(self.client.get_run(run_id).info.lifecycle_stage == "active")
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_DOES_NOT_EXIST":
+                raise
+            return False
 
     def delete_run(self, run_id: str) -> None:
         """Deletes a run and its models, which MLflow would keep."""
@@ -378,9 +392,11 @@ def publish(folder: Path, store: Store, is_primary: bool = True) -> bool:
             any, and notes in a file of its own how far it came.
 
     Raises:
-        ValueError: on a damaged journal.
+        ValueError: on a damaged journal, or a folder that is a link.
         MlflowException, OSError, sqlite3.Error: when MLflow cannot be reached; what is missing stays to be published.
     """
+    if folder.is_symlink():
+        raise ValueError(f"{folder} is a link, behind which nothing is written")
     folder = folder.resolve()
     note = _note(folder, store, is_primary)
     with alone(note.with_suffix(".lock")):
@@ -453,7 +469,7 @@ def brought(folder: Path) -> "Cursor | None":
 
 def _parent_run(folder: Path, store: Store, commit: Commit, is_primary: bool) -> str | None:
     """The run that a folder's is shown under, which is published if it is not yet there."""
-    if not commit.parent:
+    if not re.fullmatch(rf"\.\./\.\./{PLACE}", commit.parent):
         return None
     parent = (folder / commit.parent).resolve()
     if not parent.exists():
@@ -482,6 +498,8 @@ class Cursor:
                 store.delete_run(cursor.run_id)  # it shows lines that the journal has taken back
             cursor = cls(store.address, commit.identity)
             cursor.save(note)  # should MLflow be out of reach, `unfinished` tells others where it is to go
+        elif cursor.run_id and not store.has_run(cursor.run_id):
+            cursor = cls(store.address, commit.identity)
         if not cursor.run_id:
             cursor = replace(cursor, run_id=store.open_run(folder, commit))
             cursor.save(note)

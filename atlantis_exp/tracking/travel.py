@@ -11,7 +11,6 @@ import os
 import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
-from math import inf
 from pathlib import Path
 from typing import Literal, Self
 
@@ -31,6 +30,7 @@ from atlantis_exp.tracking.store import (
     CHUNK,
     FILES_TAG,
     ORIGIN,
+    PLACE,
     SMALL_FILES,
     TRAVELS,
     Cursor,
@@ -46,7 +46,6 @@ from atlantis_exp.tracking.store import (
 
 _log = logging.getLogger(__name__)
 
-_PLACE = r"([a-z]+)/[A-Za-z0-9][A-Za-z0-9_.,~+=@-]{0,199}"
 _JOURNAL = f"{TRAVELS}/journal"
 
 Outcome = Literal["brought", "ahead", "other", "growing"]
@@ -56,7 +55,7 @@ Outcome = Literal["brought", "ahead", "other", "growing"]
 def place(run: StoredRun, outputs: Path) -> Path:
     """Returns the folder under `outputs` that a run belongs into. Raises: ValueError."""
     named = "/".join(run.folder.parts[-2:])
-    parts = re.fullmatch(_PLACE, named)
+    parts = re.fullmatch(PLACE, named)
     if parts is None or parts[1] == "artifacts":  # which is MLflow's
         raise ValueError(f"it comes from {str(run.folder)!r}, which is no run folder's place")
     return outputs / named
@@ -91,14 +90,18 @@ def bring(run: StoredRun, folder: Path, store: Store, listed: Collection[str]) -
     if COMMIT not in small:
         raise ValueError(f"the server lacks its {COMMIT}")
     commit = commit_of(small[COMMIT])
+    if commit.offset > ARTIFACT:
+        raise ValueError(f"its journal of {commit.offset:,} bytes is longer than {ARTIFACT:,}")
     _check_parent(folder, commit.parent)
     local = _Local.of(folder, store)
     decision, start = _decide(local, commit, listed)
     if decision != "brought":
         return decision
-    if local.commit is not None and local.commit.identity != commit.identity:
-        (folder / COMMIT).unlink()  # readers first: the journal changes under them next
-    Cursor(store.address, commit.identity, run.run_id, commit.offset, files_digest(small)).save(folder / ORIGIN)
+    origin = Cursor(store.address, commit.identity, run.run_id, commit.offset, files_digest(small))
+    goes_on = local.commit is not None and local.commit.identity == commit.identity
+    if not goes_on:
+        (folder / COMMIT).unlink(missing_ok=True)  # readers first: the journal changes under them next
+        origin.save(folder / ORIGIN)
     restore(folder, start, _journal(files, start, commit.offset))
     records = (record for _, record in read(folder, start, commit.offset))
     named = {record.path: record for record in records if isinstance(record, Artifact | Image | Model)}
@@ -109,6 +112,8 @@ def bring(run: StoredRun, folder: Path, store: Store, listed: Collection[str]) -
         else:
             (folder / name).unlink(missing_ok=True)
     write_file(folder / COMMIT, small[COMMIT])
+    if goes_on:  # not before: what is here until then is less than the server has, and not to be sent there
+        origin.save(folder / ORIGIN)
     return "brought"
 
 
@@ -149,7 +154,7 @@ def _check_parent(folder: Path, parent: str) -> None:
     """Refuse a parent that is no run folder's place, or that is shown under the folder itself."""
     place = folder = Path(os.path.normpath(folder))
     while parent:
-        if not re.fullmatch(rf"\.\./\.\./{_PLACE}", parent):
+        if not re.fullmatch(rf"\.\./\.\./{PLACE}", parent):
             raise ValueError(f"its parent {parent!r} is no run folder's place")
         place = Path(os.path.normpath(place / parent))
         if place == folder:
@@ -161,18 +166,17 @@ def _check_parent(folder: Path, parent: str) -> None:
 def _journal(files: Files, start: int, end: int) -> Iterator[bytes]:
     """The bytes of a journal between two offsets; the server's pieces may overlap, since they may be sent again."""
     named = (re.fullmatch(r"(\d{12})\.gz", name) for name in files.names(_JOURNAL))
-    begins = sorted(int(name[1]) for name in named if name)
-    for begin, following in zip(begins, [*begins[1:], inf], strict=True):
-        if start >= end or begin > start:
-            break
-        if following <= start:
-            continue
-        with gzip.GzipFile(fileobj=io.BytesIO(files.read(f"{_JOURNAL}/{begin:012d}.gz", 2 * CHUNK))) as packed:
-            piece = packed.read(CHUNK)[start - begin : end - begin]
+    begins = sorted((int(name[1]) for name in named if name), reverse=True)
+    while start < end:
+        for begin in (begin for begin in begins if start - CHUNK < begin <= start):
+            with gzip.GzipFile(fileobj=io.BytesIO(files.read(f"{_JOURNAL}/{begin:012d}.gz", 2 * CHUNK))) as packed:
+                piece = packed.read(CHUNK)[start - begin : end - begin]
+            if piece:
+                break
+        else:
+            raise ValueError(f"the server lacks its journal from byte {start} on")
         yield piece
         start += len(piece)
-    if start < end:
-        raise ValueError(f"the server lacks its journal from byte {start} on")
 
 
 def _bring_files(

@@ -28,6 +28,8 @@ class Forecast:
     memory_available: int  # bytes
     disk: int  # bytes under the outputs folder
     disk_available: int  # bytes
+    held: float = math.inf  # observations that the replay memory's bytes will hold
+    learn_start: int = 0  # transitions
 
     @property
     def hours(self) -> float:
@@ -44,6 +46,11 @@ class Forecast:
     @property
     def shortage(self) -> str | None:
         """What will not suffice and what to do about it, None where all does."""
+        if self.held <= self.learn_start:
+            return (
+                f"nothing would be learned: replay.max_bytes holds some {self.held:,.0f} observations, and learning "
+                f"begins after {self.learn_start:,}; raise replay.max_bytes or lower training.learn_start"
+            )
         if self.memory > self.memory_available:
             return (
                 f"memory will not suffice: {_size(self.memory)} needed, {_size(self.memory_available)} available; "
@@ -84,6 +91,9 @@ def forecast(
         steps = emulators.step(actions)
         for env in range(num_envs):
             memory.add(env, int(actions[env]), float(steps.rewards[env]), steps.observations[env], False)
+        ended = np.flatnonzero(steps.terminated | steps.truncated).tolist()
+        for env, observation in zip(ended, emulators.reset(ended) if ended else (), strict=True):
+            memory.begin(env, observation)  # else a screen that stands still would be measured
 
     def update() -> None:
         ids, weights = sampler.sample(memory, plan.batch_size, rng)
@@ -101,8 +111,10 @@ def forecast(
     acts = 1 - epsilon**num_envs  # share of the iterations in which any environment asks the network
     seconds_a_step = (play_seconds + acts * act_seconds) / num_envs + update_seconds / plan.learn_every
     steps = max(1, (length if trainer.max_steps is None else min(length, trainer.max_steps)) - steps_done)
-    stored = min(capacity, steps_done + steps)
-    replay_bytes = min(max_bytes, stored * memory.nbytes // memory.next_id)
+    an_observation = memory.nbytes / (memory.next_id - memory.oldest_id)  # bytes
+    replay_bytes = int(min(max_bytes, min(capacity, steps_done + steps) * an_observation))
+    there = trainer.memory.next_id - trainer.memory.oldest_id  # in a run that goes on, read already
+    more_bytes = max(0, replay_bytes - int(there * an_observation))
     weights = sum(tensor.nbytes for tensor in learner.network.state_dict().values())
     cadence = trainer.recorder.cadence
     evaluations = 1 + steps / (cadence.evaluate_steps or math.inf)
@@ -110,11 +122,13 @@ def forecast(
     return Forecast(
         steps_per_second=1 / seconds_a_step,
         steps=steps,
-        memory=replay_bytes + _WARM_MEMORY,
+        memory=more_bytes + _WARM_MEMORY,
         memory_available=psutil.virtual_memory().available,
         # Two generations of all networks and two moments; weights of each evaluation, in the folder and in MLflow.
-        disk=int(replay_bytes + (10 if learner.ema else 8) * weights + 2 * evaluations * weights),
+        disk=int(more_bytes + (10 if learner.ema else 8) * weights + 2 * evaluations * weights),
         disk_available=shutil.disk_usage(_existing(trainer.checkpoints.folder)).free,
+        held=max_bytes / an_observation,
+        learn_start=plan.learn_start,
     )
 
 

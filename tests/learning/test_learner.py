@@ -337,6 +337,23 @@ def test_the_evaluated_network_is_a_mean_of_all_weights_first_and_an_exponential
         torch.testing.assert_close(average.double(), expected, rtol=1e-5, atol=1e-7)
 
 
+def test_an_average_that_begins_with_given_weights_keeps_them_also_across_a_restart() -> None:
+    learner, again = (_learner(DQNCnn, ema=40) for _ in range(2))
+    given = copy.deepcopy(learner.network.state_dict())
+    learner.begin_with(given)
+    batch = _batch(_SIDE[DQNCnn])
+    expected = {key: value.double() for key, value in given.items()}
+    for part in (learner, again):
+        for _ in range(2):
+            for _ in range(10):
+                part.update(*batch)
+            for key, value in part.network.state_dict().items():
+                expected[key] = 0.75 * expected[key] + 0.25 * value.double()
+        again.load_state_dict(copy.deepcopy(part.state_dict()))
+    for key, average in again.evaluated.state_dict().items():
+        torch.testing.assert_close(average.double(), expected[key], rtol=1e-5, atol=1e-7)
+
+
 @every_network
 @every_precision
 @pytest.mark.thinned(4)

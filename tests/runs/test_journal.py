@@ -30,6 +30,7 @@ from atlantis_exp.runs.journal import (
     Tracker,
     adopt,
     curve,
+    fitted,
     read,
     read_commit,
 )
@@ -433,6 +434,18 @@ def test_an_unknown_kind_of_record_is_named(tmp_path: Path) -> None:
     (tmp_path / "journal.jsonl").write_text('{"kind":"hologram"}\n')
     with pytest.raises(ValueError, match="hologram"):
         list(read(tmp_path, 0, 20))
+
+
+@pytest.mark.parametrize("room", [0, 59, 60, 200, 1_099, 1_100])
+def test_a_table_in_a_note_keeps_to_its_room_and_says_what_it_leaves_out(room: int) -> None:
+    lines = [f"line {number:05}" for number in range(100)]  # 100 x 10 characters, and 99 ends
+    text = fitted(lines, room, "`x.csv`")
+    kept, _, left = text.partition("\n\n... and ")
+    shown = kept.splitlines()
+    assert shown == lines[: len(shown)]
+    assert left == ("" if room >= 1_099 else f"{100 - len(shown)} more in `x.csv`.")
+    assert len(text) <= max(room, 60)
+    assert len(shown) >= (room - 60) // 11
 
 
 def test_a_folder_without_a_journal_has_no_commit_and_no_records(tmp_path: Path) -> None:

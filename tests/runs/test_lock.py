@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from atlantis_exp.faults import Fault
+from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.lock import alone, held, is_held
 
@@ -46,6 +47,22 @@ def test_a_folder_that_another_process_holds_is_refused_with_its_name(tmp_path: 
         assert is_held(tmp_path)  # to ask does not take it away
     assert process.returncode == 0
     assert not is_held(tmp_path)
+
+
+def test_pipes_in_the_place_of_its_files_hold_nobody_up(tmp_path: Path) -> None:
+    with holder(tmp_path):
+        (tmp_path / "holder.txt").unlink()
+        os.mkfifo(tmp_path / "holder.txt")
+        with pytest.raises(Fault, match=r"^run y is held by another process$"), held(tmp_path, "run y", 0.0):
+            pass
+    with pytest.raises(OSError, match=r"holder\.txt"), held(tmp_path, "run y", 0.0):
+        pass
+    (tmp_path / "lock").unlink()
+    os.mkfifo(tmp_path / "lock")
+    assert not is_held(tmp_path)
+    os.mkfifo(tmp_path / "x.aside")
+    with pytest.raises(OSError, match=r"x\.aside"):
+        write_file(tmp_path / "x", b"")
 
 
 @pytest.mark.parametrize("link", ["", "checkpoints", "a/b/c"])

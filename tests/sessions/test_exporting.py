@@ -175,6 +175,9 @@ def test_an_export_neither_overwrites_nor_starts_without_weights(
     assert not (tmp_path / "new").exists()
     assert command("export", outputs, "weights=latest", f"to={tmp_path}") == 2
     assert capsys.readouterr().err == f"atlantis_exp: to={tmp_path}: is not empty; name another folder\n"
+    (tmp_path / "file").touch()
+    assert command("export", outputs, "weights=latest", f"to={tmp_path}/file") == 2
+    assert capsys.readouterr().err == f"atlantis_exp: to={tmp_path}/file: is not empty; name another folder\n"
 
 
 @pytest.mark.slow

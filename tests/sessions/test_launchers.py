@@ -118,13 +118,15 @@ def test_the_launcher_of_a_command_line_is_known_and_a_missing_extra_is_one_line
 
 @pytest.mark.parametrize(("n_jobs", "share"), [(1, 8), (2, 4), (3, 2), (16, 2), (-1, 2)])
 def test_jobs_share_the_cores_of_the_machine(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_jobs: int, share: int
+    tiny: Compose, recorded: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, n_jobs: int, share: int
 ) -> None:
     joblib = pytest.importorskip("joblib", reason="the extra joblib is not installed")
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(joblib, "cpu_count", lambda: 8)
     monkeypatch.setattr(joblib, "effective_n_jobs", lambda jobs: 8 if jobs == -1 else jobs)
-    with _shared_cores(Launcher("joblib", n_jobs), [RunFolder(tmp_path / name) for name in "abc"]):
+    jobs = [Job(tiny(f"seed={seed}")) for seed in range(4)]
+    recorded("seed=3")
+    with _shared_cores(Launcher("joblib", n_jobs), jobs):
         assert os.environ["OMP_NUM_THREADS"] == str(share)
     assert "OMP_NUM_THREADS" not in os.environ
 

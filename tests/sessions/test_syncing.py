@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import json
 import signal
 import sqlite3
 import subprocess
@@ -12,7 +13,7 @@ from contextlib import AbstractContextManager, closing, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
-from typing import Any
+from typing import Any, ClassVar, cast
 
 import PIL.Image
 import pytest
@@ -29,7 +30,8 @@ from atlantis_exp.runs.journal import Commit, Journal, adopt, commit_bytes, read
 from atlantis_exp.sessions.syncing import sync
 from atlantis_exp.tracking import travel
 from atlantis_exp.tracking.publishing import catch_up
-from atlantis_exp.tracking.store import Store, TooSlow, _pages, files_digest, publish, unfinished
+from atlantis_exp.tracking.store import Files, Store, TooSlow, _pages, files_digest, publish, unfinished
+from atlantis_exp.tracking.travel import _journal
 
 REPOSITORY = Path(__file__).parents[2]
 Served = Callable[[Path, int], AbstractContextManager[None]]
@@ -331,6 +333,49 @@ def test_a_server_cannot_send_the_password_to_another_one(
         synced(tmp_path / "laptop", f"from={uri}", experiment)
     assert f"its files are said to be on {host}, another server, which is not asked" in capsys.readouterr().err
     assert asked == []
+
+
+def test_a_folder_that_names_a_server_is_not_sent_there_with_the_password(
+    tmp_path: Path,
+    stranger: tuple[str, list[tuple[str, str | None]]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("MLFLOW_TRACKING_USERNAME", "me")
+    monkeypatch.setenv("MLFLOW_TRACKING_PASSWORD", "secret")
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    host, asked = stranger
+    uri = f"http://{host}"
+    run = a_sweep_of_one(tmp_path, "copied")
+    for folder in (run, tmp_path / "sweeps/sweep-copied"):
+        (folder / "published.json").write_text(json.dumps({"store": f"{uri}#atlantis", "identity": "x"}))
+    catch_up(tmp_path)
+    assert asked == []
+    said = f"atlantis_exp: {uri} lacks parts of 2 runs; python -m atlantis_exp sync to={uri} sends them\n"
+    assert capsys.readouterr().err.endswith(said)
+    monkeypatch.setattr("atlantis_exp.tracking.publishing._DRAIN_SECONDS", 0.5)
+    catch_up(tmp_path, uri)
+    assert asked
+
+
+def test_pieces_of_a_journal_may_have_been_sent_again_from_its_beginning() -> None:
+    whole = bytes(range(250)) * 4
+
+    class Sent:
+        """Old pieces of 500 bytes, and a later one of all."""
+
+        pieces: ClassVar = {0: whole, 500: whole[500:900]}
+
+        def names(self, _: str) -> set[str]:
+            return {f"{begin:012d}.gz" for begin in self.pieces}
+
+        def read(self, path: str, _: int) -> bytes:
+            return gzip.compress(self.pieces[int(path[-15:-3])])
+
+    for start in (0, 1, 500, 700, 900, 999):
+        assert b"".join(_journal(cast(Files, Sent()), start, 1_000)) == whole[start:]
+    with pytest.raises(ValueError, match="from byte 1000 on"):
+        [*_journal(cast(Files, Sent()), 0, 1_001)]
 
 
 def test_every_folder_of_the_outputs_is_published_and_stays_at_home(tmp_path: Path) -> None:

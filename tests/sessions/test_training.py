@@ -23,10 +23,11 @@ from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.facts import read_facts
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Artifact, Image, Journal, Metrics, Model, read
+from atlantis_exp.sessions import verifying
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.reporting import report
 from atlantis_exp.sessions.training import train
-from atlantis_exp.sessions.verifying import fingerprints, train_and_kill
+from atlantis_exp.sessions.verifying import Session, fingerprints, run_and_kill, start, train_and_kill
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.tracking.store import Store, publish
 from atlantis_exp.training.checkpoint import Checkpoints
@@ -208,6 +209,49 @@ def test_a_config_that_was_lost_is_written_again(tiny: Compose) -> None:
     train(Job(config))
     assert RunFolder.of(config).config == to_dict(config)
     assert RunFolder.of(config).state == "done"
+
+
+def test_slurms_next_try_of_a_run_goes_on_whatever_resume_says(tiny: Compose, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = tiny(*SHORT, "resume=never")
+    train(Job(config))
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    train(Job(config))
+    assert [path.name for path in RunFolder.of(config).path.parent.iterdir()] == [config.run_name()]
+
+
+def test_a_run_that_is_made_longer_is_done_at_its_new_end(recorded: Callable[..., Path]) -> None:
+    folder = RunFolder(recorded(outcome="budget"))
+    states: list[str] = [folder.state]
+    journal = Journal(folder.path)
+    with folder.held():
+        journal.status("RUNNING")
+        states.append(folder.state)
+    states.append(folder.state)
+    for status in ("KILLED", "FAILED", "FINISHED"):
+        journal.status(status)
+        states.append(folder.state)
+    assert states == ["done", "running", "interrupted", "interrupted", "failed", "done"]
+
+
+def test_a_session_does_not_outlive_the_one_who_would_kill_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sessions: list[Session] = []
+
+    def start_one(said: Path) -> Session:
+        sessions.append(start(("sleep", "60"), said))
+        return sessions[0]
+
+    looks = iter([0])  # and then, as if a person pressed Ctrl-C
+
+    def generations(*_: object) -> int:
+        try:
+            return next(looks)
+        except StopIteration:
+            raise KeyboardInterrupt from None
+
+    monkeypatch.setattr(verifying, "generations", generations)
+    with pytest.raises(KeyboardInterrupt):
+        run_and_kill(start_one, tmp_path, "*", 1)
+    assert sessions[0].wait() == -signal.SIGKILL
 
 
 def test_resume_must_refuses_to_start_and_resume_never_keeps_what_was_there(tiny: Compose) -> None:

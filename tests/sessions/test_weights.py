@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from atlantis_exp.config import Config
+from atlantis_exp.faults import Fault
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.sessions.job import Job
@@ -51,6 +52,14 @@ def test_best_is_what_the_last_commit_says(interrupted: RunFolder) -> None:
     weights, step = stored_weights(interrupted, "best")
     assert (step, weights) == (80, (files / "80.safetensors").read_bytes())
     assert weights != (files / "160.safetensors").read_bytes()
+
+
+def test_a_damaged_journal_of_a_folder_without_checkpoints_is_one_line(recorded: Callable[..., Path]) -> None:
+    run = RunFolder(recorded())
+    journal = run.path / "journal.jsonl"
+    journal.write_bytes(journal.read_bytes().replace(b"{", b"[", 1))
+    with pytest.raises(Fault, match=f"^run {run.name}: .*byte 0"):
+        stored_weights(run, "best")
 
 
 @pytest.mark.slow

@@ -133,3 +133,35 @@ def test_a_shortage_is_named_with_what_to_do_about_it(memory: int, disk: int, sa
         "expect about 100 steps/s, 10.0 hours for 3,600,000 steps, 1.0 GiB of memory (2.0 GiB available), "
         "1 MiB of disk (2.0 GiB free)"
     )
+
+
+def test_a_memory_that_never_holds_enough_to_learn_from_is_named() -> None:
+    expected = Forecast(100.0, 3_600_000, GIB, 2 * GIB, GIB, 2 * GIB, held=3_800.4, learn_start=10_000)
+    assert (expected.shortage or "").startswith("nothing would be learned: replay.max_bytes holds some 3,800 observ")
+
+
+def test_a_screen_that_stands_still_after_a_game_is_not_measured_and_what_is_there_already_is_not_asked_for(
+    small: Callable[..., Trainer], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trainer = small(tmp_path, num_envs=2)
+    resets: list[list[int]] = []
+    reset = trainer.emulators.reset
+
+    def counted(envs: Any, *seeds: Any) -> Any:
+        resets.append(list(envs))
+        return reset(envs, *seeds)
+
+    def many(call: Callable[[], object], at_least: int, **__: float) -> float:
+        for _ in range(200 if at_least == 8 else at_least):
+            call()
+        return 1e-3
+
+    monkeypatch.setattr(trainer.emulators, "reset", counted)
+    monkeypatch.setattr(forecast_module, "_median_seconds", many)
+    fresh = expected_of(trainer, 8, max_bytes=2**30, capacity=10**9)
+    assert len(resets) == 200 // 40 + 2
+    assert resets[0] == resets[-1] == [0, 1]
+    trainer.run(lambda: trainer.counters.steps >= 100)
+    half = expected_of(trainer, 8, max_bytes=2**30, capacity=10**9)
+    assert 2**29 < half.memory < fresh.memory
+    assert half.disk < fresh.disk

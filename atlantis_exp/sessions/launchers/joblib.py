@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 
 from atlantis_exp.faults import Fault
+from atlantis_exp.runs.files import no_link
 from atlantis_exp.runs.folder import OUTPUT, RunFolder
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
@@ -18,29 +19,31 @@ from atlantis_exp.sessions.stopping import sweep_goes_on
 
 @contextmanager
 def jobs(
-    journal: Journal, folders: Sequence[RunFolder], close_page: Callable[[], None], launcher: Launcher
+    journal: Journal, trainings: Sequence[Job], close_page: Callable[[], None], launcher: Launcher
 ) -> Iterator[None]:
     """Share the cores among the workers that the block starts, and have all jobs commit at its end."""
     from joblib.externals.loky.backend import resource_tracker as its_own
 
-    with _shared_cores(launcher, folders):
+    with _shared_cores(launcher, trainings):
         for tracker in (resource_tracker, its_own):
             tracker.ensure_running()  # started later, it would lift the mask
         # A worker that a signal ends would take all others along: they inherit the mask. The signals reach this
         # process all the same, through its other threads.
+        folders = [RunFolder.of(job.config) for job in trainings]
         with committed_at_the_end(journal, folders, close_page, is_masked=True):
             yield
 
 
 @contextmanager
-def _shared_cores(launcher: Launcher, folders: Sequence[RunFolder]) -> Iterator[None]:
+def _shared_cores(launcher: Launcher, trainings: Sequence[Job]) -> Iterator[None]:
     """Tell the workers their share of the cores, unless a person has."""
     if "OMP_NUM_THREADS" in os.environ:
         yield
         return
     from joblib import cpu_count, effective_n_jobs
 
-    at_once = min(effective_n_jobs(launcher.n_jobs), sum(folder.state != "done" for folder in folders))
+    left = sum(RunFolder.of(job.config).ended(job.config.budget.steps) is None for job in trainings)
+    at_once = min(effective_n_jobs(launcher.n_jobs), left)
     share = str(max(cpu_count() // max(at_once, 1), 1))
     os.environ |= {"OMP_NUM_THREADS": share, "MKL_NUM_THREADS": share}
     try:
@@ -57,7 +60,7 @@ def train_apart(job: Job) -> None:
     if not sweep_goes_on(folder, job.launcher)():
         raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
     folder.path.mkdir(parents=True, exist_ok=True)
-    with open(folder.path / OUTPUT, "a+") as output:
+    with open(folder.path / OUTPUT, "a+", opener=no_link) as output:
         start = output.tell()
         code = subprocess.run(
             [sys.executable, "-m", "atlantis_exp", "train", *job.overrides],

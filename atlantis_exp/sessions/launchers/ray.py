@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from typing import Any
 
+from atlantis_exp.runs.files import no_link
 from atlantis_exp.runs.folder import OUTPUT, RunFolder
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
@@ -42,7 +43,7 @@ def train_there(job: Job) -> None:
     folder = RunFolder.of(job.config)
     folder.path.mkdir(parents=True, exist_ok=True)
     with (
-        open(folder.path / OUTPUT, "a", buffering=1) as output,
+        open(folder.path / OUTPUT, "a", buffering=1, opener=no_link) as output,
         redirect_stdout(output),
         redirect_stderr(output),
         as_one_line(folder.name),
