@@ -407,6 +407,9 @@ def publish(folder: Path, store: Store, is_primary: bool = True) -> bool:
         cursor = Cursor.of(note, folder, store, commit)
         if cursor.files == files_digest(files):
             return False
+        if not store.has_run(cursor.run_id):  # somebody has deleted it, and here it went on
+            Cursor(store.address, commit.identity).save(note)
+            cursor = Cursor.of(note, folder, store, commit)
         mirror = _Mirror(folder, store, cursor.run_id)
         if not store.is_local:
             mirror.send_journal(cursor.offset, commit.offset)
@@ -498,8 +501,6 @@ class Cursor:
                 store.delete_run(cursor.run_id)  # it shows lines that the journal has taken back
             cursor = cls(store.address, commit.identity)
             cursor.save(note)  # should MLflow be out of reach, `unfinished` tells others where it is to go
-        elif cursor.run_id and not store.has_run(cursor.run_id):
-            cursor = cls(store.address, commit.identity)
         if not cursor.run_id:
             cursor = replace(cursor, run_id=store.open_run(folder, commit))
             cursor.save(note)

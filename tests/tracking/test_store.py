@@ -539,6 +539,35 @@ def test_a_folder_remembers_the_store_that_lacks_a_part_of_it(tmp_path: Path, st
     assert lacking.address == store.address
 
 
+def test_a_run_that_somebody_deleted_in_mlflow_is_made_again_once_it_goes_on(
+    tmp_path: Path, root: Path, store: Store
+) -> None:
+    journal = a_full_journal(tmp_path)
+    publish(tmp_path, store)
+    whole, gone = points(root, tmp_path), run_id(tmp_path)
+    store.client.delete_run(gone)
+    publish(tmp_path, store)
+    assert run_id(tmp_path) == gone  # there is nothing new to send
+    journal.status("FINISHED")
+    publish(tmp_path, store)
+    assert run_id(tmp_path) != gone
+    assert points(root, tmp_path) == whole
+    (tmp_path / "published.json").write_text(
+        (tmp_path / "published.json").read_text().replace(run_id(tmp_path), "a" * 32)
+    )
+    journal.status("KILLED")
+    publish(tmp_path, store)
+    assert points(root, tmp_path) == whole
+
+
+def test_a_folder_that_is_a_link_is_not_published(tmp_path: Path, store: Store) -> None:
+    a_full_journal(tmp_path / "elsewhere")
+    (tmp_path / "run").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ValueError, match="run is a link"):
+        publish(tmp_path / "run", store)
+    assert not (tmp_path / "elsewhere" / "published.json").exists()
+
+
 @pytest.mark.parametrize("damaged", ["", "{", '{"store": "a", "identity": "b", "offset": "many"}'])
 def test_a_damaged_note_of_what_was_sent_doubles_nothing(
     tmp_path: Path, root: Path, store: Store, damaged: str
