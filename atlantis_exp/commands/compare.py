@@ -50,7 +50,7 @@ def margin(delta: str | float | None) -> tuple[float | None, bool]:
     """A difference that does not matter, and whether it is a share of a score. Raises: ConfigError."""
     if delta is None:
         return None, False
-    text = delta if isinstance(delta, str) else f"{delta:g}"
+    text = delta if isinstance(delta, str) else f"{delta:.15g}"
     try:
         value = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
     except ValueError:

@@ -34,7 +34,7 @@ from atlantis_exp.comparison.words import spent
 from atlantis_exp.config import PathsConfig, TrackingConfig
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
-from atlantis_exp.runs.folder import BEST_EPISODE, RunFolder
+from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.tracking.publishing import how_to_open, publishing
 
@@ -89,7 +89,8 @@ def compare(
     asked = families([group_of(members, question.by) for members in groups.values()], question)
 
     # Before a look is spent and the folder held: it takes minutes.
-    probed = probe(groups, asked[-1].plan.baseline if asked else None) if probe else Probed({}, {}, (), {})
+    baseline = next((each.plan.baseline for each in asked if each.plan.baseline is not None), None)
+    probed = probe(groups, baseline) if probe else Probed({}, {}, (), {})
 
     identity = {
         **asdict(question),
@@ -141,7 +142,7 @@ def compare(
             journal.finish()
     _print(comparison)
     players = [player for player in gathered.players if plays_alike(player, trainings[0])]
-    _print_film(outputs, (*trainings, *players))
+    _print_film((*trainings, *players))
     print(f"{how_to_open(outputs)}\n{folder.artifact(_PAGE)}")
     if COMMIT in question.by and (worse := worse_than_baseline(comparison.answers)):
         raise Fault(f"worse than the baseline {question.baseline}: {'; '.join(worse)}")
@@ -149,13 +150,13 @@ def compare(
 
 
 def worse_than_baseline(answers: Sequence[Answer]) -> list[str]:
-    """The groups that were found worse than their family's baseline, by how much."""
+    """The commits that were found worse than the baseline, by how much."""
     return [
         f"{verdict.group} by {-verdict.difference:,.0f} points ({-verdict.high:,.0f} to {-verdict.low:,.0f}, "
         f"{verdict.seeds} seeds each)"
         for each in answers
         for verdict in each.decision.verdicts
-        if each.family.plan.baseline is not None and verdict.said == "worse"
+        if each.family.plan.baseline is not None and COMMIT in each.family.name.split(",") and verdict.said == "worse"
     ]
 
 
@@ -207,12 +208,11 @@ def _print(comparison: Comparison) -> None:
         console.print(f"\n{sentence}")
 
 
-def _print_film(outputs: Path, played: Sequence[Training | Player]) -> None:
+def _print_film(played: Sequence[Training | Player]) -> None:
     """Say where the highest score of all can be seen, if it was filmed."""
     best = max(played, key=lambda each: each.episodes.scores.max())
-    for place in ("runs", "evaluations"):
-        if (film := RunFolder(outputs / place / best.name).artifact(BEST_EPISODE)).exists():
-            print(f"\nthe highest score, {best.episodes.scores.max():,.0f}, as a film: {film}")
+    if best.film is not None and best.film.exists():
+        print(f"\nthe highest score, {best.episodes.scores.max():,.0f}, as a film: {best.film}")
 
 
 def slug(groups: Sequence[str]) -> str:

@@ -209,7 +209,7 @@ def _reference_lines(draw_line: Callable[..., Any], comparison: Comparison, low:
         shown = [row for row in shown if row["name"] != "random player"]
     styles = ((0, (1, 1)), (0, (4, 2)), (0, (6, 2, 1, 2)), (0, (2, 3)))
     for index, row in enumerate(shown):
-        label = f"{row['name']}{', published' if 'published' in row['protocol'] else ''} ({row['score']:,.0f})"
+        label = f"{row['name']}{', published' if 'published' in row['protocol'] else ''} (mean {row['score']:,.0f})"
         draw_line(row["score"], color="#8c8c8c", linewidth=1, linestyle=styles[index % len(styles)], label=label)
 
 

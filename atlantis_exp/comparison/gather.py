@@ -3,6 +3,7 @@
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -17,7 +18,7 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.facts import read_tags
-from atlantis_exp.runs.folder import EVALUATION, RESULT, RunFolder, evaluation_at
+from atlantis_exp.runs.folder import BEST_EPISODE, EVALUATION, RESULT, RunFolder, evaluation_at
 from atlantis_exp.runs.journal import curve
 
 Array = npt.NDArray[np.float64]
@@ -58,6 +59,7 @@ class Training:
     episodes: EpisodeTable
     tags: dict[str, str]  # what the run says about itself: device, precision, git.commit, versions
     policy: str  # in words, what the network did most in these episodes; empty where nobody said
+    film: Path | None = None  # of one of these episodes, if there is one
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -82,6 +84,7 @@ class Player:
     name: str
     config: dict[str, Any]  # dotted keys
     episodes: EpisodeTable
+    film: Path | None = None  # of one of these episodes, if there is one
 
     @property
     def called(self) -> str:
@@ -118,7 +121,7 @@ class _Unusable(ValueError):
 
 
 def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None, put_aside: bool = False) -> Gathered:
-    """Read all finished runs under `outputs`, or those whose name begins with or fits one of the patterns `runs`.
+    """Read all finished runs under `outputs`, trainings only if their name begins with or fits one of the `runs`.
 
     A training's episodes are those of its latest evaluation after its last step, be it the training's own or one that
     the verb `evaluate` made; given `epsilon`, of the latest at that epsilon. What resume=never put aside is left out
@@ -133,20 +136,20 @@ def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None
 
     gathered = Gathered()
     evaluations, exported = _evaluations(outputs, gathered.skipped)
-    gathered.players += [player for player in exported if is_asked_for(player.name)]
+    gathered.players += exported
     for folder in [RunFolder(path) for path in sorted((outputs / "runs").glob("*")) if path.is_dir()]:
-        if not is_asked_for(folder.name):
-            continue
+        is_asked = is_asked_for(folder.name)
         try:
             tree = _config(folder, put_aside)
             if any(key in tree for key in _PLAYERS):
-                gathered.players.append(Player(folder.name, flatten(tree), _episodes(folder.artifact(EVALUATION))))
+                gathered.players.append(_player(folder, tree))
+                continue
+            if not is_asked:
                 continue
             gathered.trainings.append(_training(folder, parse(Config, tree), evaluations.get(folder.name, []), epsilon))
-        except _Unusable as error:
-            gathered.skipped[folder.name] = str(error)
         except (Fault, ValueError, KeyError, TypeError, OSError) as error:
-            gathered.skipped[folder.name] = f"broken: {error}"
+            if is_asked:
+                gathered.skipped[folder.name] = f"{'' if isinstance(error, _Unusable) else 'broken: '}{error}"
     return gathered
 
 
@@ -164,7 +167,11 @@ def select(trainings: Iterable[Training], where: Sequence[str]) -> list[Training
         if not equals:
             raise ConfigError(f"where={text}: write KEY=VALUE, as in where=model=cnn,seed=0")
         _check_key("where", key, selected)
-        selected = [run for run in selected if value in _spellings(run.facts.get(resolve(key, run.facts)))]
+        found = {run.name: run.facts.get(resolve(key, run.facts)) for run in selected}
+        left = [run for run in selected if _is(found[run.name], value)]
+        if selected and not left:
+            raise ConfigError(f"where={text}: no run has it; {nearest(value, {str(each) for each in found.values()})}")
+        selected = left
     return selected
 
 
@@ -261,9 +268,12 @@ def _check_key(option: str, key: str, trainings: Sequence[Training]) -> None:
         raise ConfigError(f"{option}={key}: no such key; {nearest(key, {k for run in trainings for k in run.facts})}")
 
 
-def _spellings(value: Any) -> tuple[str, str]:
-    """How a person may write a value: as Python and as YAML print it."""
-    return str(value), json.dumps(value)
+def _is(value: Any, text: str) -> bool:
+    """Whether a person may write a value so: as Python or YAML print it, a number in any way."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        with suppress(ValueError):
+            return float(text) == value
+    return text in (str(value), json.dumps(value))
 
 
 def _config(folder: RunFolder, put_aside: bool) -> dict[str, Any]:
@@ -292,8 +302,9 @@ def _training(
     if (updates := arrays.pop("updates", None)) is not None and "flops_per_update" in tags:
         arrays["flops"] = updates * float(tags["flops_per_update"])
 
-    assert folder.result is not None
-    steps = folder.result.steps
+    if (result := folder.ended(config.budget.steps)) is None:
+        raise _Unusable("unfinished: it was made longer; the command that did so continues it")
+    steps = result.steps
     tables = [(config.evaluation.epsilon, folder, folder.artifact(evaluation_at(steps)))]
     tables += [
         (later.epsilon, later.folder, later.folder.artifact(EVALUATION)) for later in evaluations if later.step == steps
@@ -306,11 +317,16 @@ def _training(
     policy = (tags if player == folder else read_tags(player.path)).get("policy", "")
     science = config.science()
     science["phase"] = {str(index): phase for index, phase in enumerate(science["phase"])}
-    budget = config.budget.steps if folder.result.outcome == "budget" else None
+    budget = config.budget.steps if result.outcome == "budget" else None
     leaves = flatten(to_dict(config)) | {"evaluation.epsilon": taken, "budget.steps": budget}
-    return Training(
-        folder.name, leaves, flatten(science), arrays, _episodes(path, facts_of(config.env.game).sources), tags, policy
-    )
+    episodes = _episodes(path, facts_of(config.env.game).sources)
+    is_filmed = player != folder or tags.get("best_evaluation", "").endswith(f" at step {steps}")
+    film = player.artifact(BEST_EPISODE) if is_filmed else None
+    return Training(folder.name, leaves, flatten(science), arrays, episodes, tags, policy, film)
+
+
+def _player(folder: RunFolder, tree: dict[str, Any]) -> Player:
+    return Player(folder.name, flatten(tree), _episodes(folder.artifact(EVALUATION)), folder.artifact(BEST_EPISODE))
 
 
 def _evaluations(outputs: Path, skipped: dict[str, str]) -> tuple[dict[str, list[_Later]], list[Player]]:
@@ -328,7 +344,7 @@ def _evaluations(outputs: Path, skipped: dict[str, str]) -> tuple[dict[str, list
             if "run" in facts:
                 found[str(facts["run"])].append(_Later(commit.updated, int(facts["step"]), epsilon, folder))
             elif "weights" in facts:
-                player = Player(folder.name, flatten(facts), _episodes(folder.artifact(EVALUATION)))
+                player = _player(folder, facts)
                 exported[str(facts["sha256"]), epsilon].append((commit.updated, folder.name, player))
         except (Fault, ValueError, KeyError, TypeError, OSError) as error:
             skipped[f"evaluations/{folder.name}"] = f"broken: {type(error).__name__}: {error}"

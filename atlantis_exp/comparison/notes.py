@@ -95,6 +95,16 @@ def different_lengths(facts: Facts) -> Iterator[str]:
         yield f"The runs were not trained equally long: {named}."
 
 
+def different_evaluations(facts: Facts) -> Iterator[str]:
+    """Evaluations of unequal size, as a single later episode of one run."""
+    holders = defaultdict(list)
+    for run in facts.trainings:
+        holders[run.episodes.scores.size].append(run.name)
+    if len(holders) > 1:
+        named = "; ".join(f"{size:,}: {_listed(names)}" for size, names in sorted(holders.items()))
+        yield f"The runs were evaluated by different numbers of episodes, each by its latest evaluation: {named}."
+
+
 def lossy(facts: Facts) -> Iterator[str]:
     """Runs that went on without a part of their replay memory."""
     if names := [run.name for run in facts.trainings if LOST in run.tags]:
@@ -240,7 +250,7 @@ def other_players(facts: Facts) -> Iterator[str]:
             "No random player was measured under these settings, so a published one takes its place; "
             f"{PROGRAM} baseline with the same env measures one."
         )
-    scores = [row["score"] for row in facts.tables["scores"]]
+    scores = [row["mean"] for row in facts.tables["evaluation"]]  # as the player's
     is_early = facts.frames <= facts_of(facts.game).early_frames
     if is_early and any(score < random_player["score"] for score in scores) and (why := early_dqn(facts.game)):
         yield why
@@ -253,6 +263,7 @@ CAVEATS: Sequence[Callable[[Facts], Iterator[str]]] = (
     modes_found,
     different_makers,
     different_lengths,
+    different_evaluations,
     lossy,
     uncommitted,
     unbalanced,

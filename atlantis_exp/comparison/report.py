@@ -125,7 +125,7 @@ COLUMNS = {
     },
     "references": {
         "name": "player",
-        "score": "score",
+        "score": "mean score",
         "points_per_frame": "points per frame",
         "protocol": "protocol",
         "source": "source",

@@ -68,7 +68,8 @@ def compare(
     named: list[tuple[str, dict[str, dict[int, float]], Answer | None]] = [
         (each.family.name, each.family.seeds, each) for each in answers
     ] or [("all", by_label, None)]
-    evaluation = [_evaluation(label, runs, game) for label, runs in groups.items()]
+    once = {label: counted(runs)[0] for label, runs in groups.items()}  # those that play equal games count as one
+    evaluation = [_evaluation(label, runs, game) for label, runs in once.items()]
     tables: dict[str, Table] = {
         "scores": [row for family in named for row in _scores(*family)],
         "seeds": [
@@ -81,18 +82,18 @@ def compare(
         "plan": [_plan(each) for each in answers],
         "looks": [row for each in answers for row in _looks(each)],
         "evaluation": evaluation,
-        "why": [_why(label, runs, game.sources) for label, runs in groups.items()],
+        "why": [_why(label, runs, game.sources) for label, runs in once.items()],
         "modes": [row for row in evaluation for row in _modes(row, by_label[row["group"]])],
-        "improvement": _improvement(groups),
+        "improvement": _improvement(once),
         "views": _views(groups),
         "runs": [row for label, runs in groups.items() for row in _runs(label, runs)],
         "curves": [row for axis in AXES for label, runs in groups.items() for row in _curve(axis, label, runs)],
         "seed_curves": [
             row for axis in AXES for label, runs in groups.items() for row in _seed_curves(axis, label, runs)
         ],
-        "profile": _profile(groups, game),
-        "actions": [row for label, runs in groups.items() for row in _actions(label, runs)],
-        "episodes": [row for label, runs in groups.items() for training in runs for row in _episodes(label, training)],
+        "profile": _profile(once, game),
+        "actions": [row for label, runs in once.items() for row in _actions(label, runs)],
+        "episodes": [row for label, runs in once.items() for training in runs for row in _episodes(label, training)],
         "references": [_measured(player) for player in players] + scores(component),
         "published_curves": [row for row in curves(component) if row["frames"] <= frames],
         "skipped": [{"run": name, "reason": reason} for name, reason in gathered.skipped.items()],
@@ -202,8 +203,7 @@ def _pooled(runs: Sequence[Training]) -> Scores:
 
 
 def _evaluation(label: str, runs: Sequence[Training], game: Game) -> Row:
-    """What the episodes of a group are like, those of runs that count as one seed once."""
-    runs = counted(runs)[0]
+    """What the episodes of a group are like."""
     summary = summarize(_pooled(runs))
     frames = np.concatenate([training.episodes.frames for training in runs])
     truncated = np.concatenate([training.episodes.truncated for training in runs])
@@ -227,7 +227,7 @@ def _why(label: str, runs: Sequence[Training], sources: Sequence[str]) -> Row:
 
     The rate is in points per 1,000 emulator frames, and its parts sum to it; they are NaN where an episode's are.
     """
-    tables = [training.episodes for training in counted(runs)[0]]
+    tables = [training.episodes for training in runs]
     scores, frames, truncated, points = (
         np.concatenate([getattr(table, name) for table in tables])
         for name in ("scores", "frames", "truncated", "points")
@@ -299,10 +299,13 @@ def _improvement(groups: Groups) -> Table:
 
 
 def _curve(axis: str, label: str, runs: Sequence[Training]) -> Table:
-    """The mean over runs as far as all of them go, with its interval where there are seeds enough."""
+    """The mean over seeds as far as all runs go, with its interval where there are seeds enough."""
     if (grid := _grid(axis, runs)) is None:
         return []
-    scores = np.array([_at(training, axis, grid) for training in runs])
+    seeds = defaultdict(list)
+    for training in runs:
+        seeds[training.config["seed"]].append(_at(training, axis, grid))
+    scores = np.array([np.mean(same, axis=0) for same in seeds.values()])
     epsilons = np.mean([_at(training, axis, grid, "epsilon") for training in runs], axis=0)
     bounds = [_mean_interval(column) for column in scores.T]
     return [
@@ -315,7 +318,8 @@ def _curve(axis: str, label: str, runs: Sequence[Training]) -> Table:
 
 def _seed_curves(axis: str, label: str, runs: Sequence[Training]) -> Table:
     """The curves of a group's several runs, where they are too few for an interval."""
-    if not 1 < len(runs) < FEWEST_SEEDS or (grid := _grid(axis, runs)) is None:
+    seeds = {training.config["seed"] for training in runs}
+    if len(runs) == 1 or len(seeds) >= FEWEST_SEEDS or (grid := _grid(axis, runs)) is None:
         return []
     return [
         {"axis": axis, "group": label, "run": training.name, "x": x, "score": score}

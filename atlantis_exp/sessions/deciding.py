@@ -4,6 +4,7 @@ The runs are ordinary ones, and the looks are those of `compare` over them, whos
 moment, the same command goes on where it was.
 """
 
+import re
 import subprocess
 import sys
 import tempfile
@@ -106,6 +107,7 @@ class _Session:
         question = request.question
         contenders: dict[str, tuple[tuple[str, ...], Job]] = {}
         configs: dict[str, dict[str, Any]] = {}
+        trained: dict[str, tuple[str, ...]] = {}  # by the name of the run
         groups = []
         for chosen in request.contenders:
             job = request.job_of((*request.fixed, *chosen))
@@ -117,6 +119,8 @@ class _Session:
             group = Group(values_in(facts, question.by), {})
             if group.label in contenders:
                 raise ConfigError(f"{' '.join(chosen)}: the same contender as {' '.join(contenders[group.label][0])}")
+            if (twin := trained.setdefault(job.config.run_name(), chosen)) is not chosen:
+                raise ConfigError(f"{' '.join(chosen)}: trains what {' '.join(twin)} trains, under the same name")
             contenders[group.label], configs[group.label] = (chosen, job), facts
             groups.append(group)
         if mixed := mixed_protocol(configs, question.by):
@@ -146,6 +150,11 @@ class _Session:
         return next(iter(self.contenders.values()))[1]
 
     @property
+    def epsilon(self) -> float:
+        """Of the evaluations that count, the same for all contenders."""
+        return self._first.config.evaluation.epsilon
+
+    @property
     def looks(self) -> tuple[int, ...]:
         """Numbers of seeds a contender."""
         return looks_up_to(self.request.question.seeds)
@@ -165,10 +174,11 @@ class _Session:
             delta = f"{100 * question.delta:.12g}%"
         return command_line(
             *("compare", f"by={','.join(question.by)}", f"runs={self.folder.name}", f"seeds={question.seeds}"),
+            f"at_epsilon={self.epsilon}",
             *([f"delta={delta}"] if delta else []),
-            *([f"baseline={question.baseline}"] if question.baseline is not None else []),
+            *([f"baseline={_quoted(question.baseline)}"] if question.baseline is not None else []),
             *([f"error={question.error}"] if question.error != Question.error else []),
-            f"paths.outputs={self.outputs}",
+            f"paths.outputs={_quoted(str(self.outputs))}",
         )
 
     def job(self, label: str, seed: int) -> Job:
@@ -210,7 +220,7 @@ class _Session:
             self.request.question,
             runs=[self.folder.name],
             where=(),
-            at_epsilon=None,
+            at_epsilon=self.epsilon,
             look_now=False,
             tracking=self.tracking,
             paths=self._first.config.paths,
@@ -377,6 +387,14 @@ def _looks(comparison: Comparison) -> str:
     ]
     head = ["| look at seeds | pair | said | difference | interval | error spent |", f"|{' --- |' * 6}"]
     return "\n".join([*head, *rows]) if rows else ""
+
+
+def _quoted(value: str) -> str:
+    """A text as Hydra takes it, in quotes where it would read something else in it."""
+    if re.fullmatch(r"[\w./-]+", value, re.ASCII):
+        return value
+    escaped = value.replace("'", r"\'")
+    return f"'{escaped}'"
 
 
 def _metric(name: str) -> str:

@@ -28,6 +28,8 @@ Command = Callable[..., int]
         (("optimizer.lr=interval(0,1)",), "optimizer.lr=interval(0,1): no list of values; write them out"),
         (("model=cnn,rsenet",), "model=rsenet: no such option in conf/model; did you mean 'resnet'?"),
         (("optimizer.lr=0.001,1e-3",), "optimizer.lr=0.001: the same contender as optimizer.lr=0.001"),
+        (("env.workers=1,2",), "env.workers=2: trains what env.workers=1 trains, under the same name"),
+        (("samplers.prioritized.alpha=0.4,0.6",), "samplers.prioritized.alpha=0.6: trains what samplers.prioritized."),
         (("model=cnn,resnet", "baseline=resnte"), "baseline=resnte: no such group; did you mean 'resnet'?"),
         (
             ("env=atlantis_v0,atlantis_v5",),

@@ -12,6 +12,7 @@ from atlantis_exp.comparison.gather import gather, group, refuse_mixed_protocols
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.registry import Game
+from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.training.evaluation import Episode, Evaluation
 
@@ -138,6 +139,40 @@ def test_groups_are_made_by_any_config_key(recorded: Recorded, tmp_path: Path) -
         group(trainings, ["optimiser.lr"])
 
 
+def test_a_run_that_is_being_made_longer_does_not_count(recorded: Recorded, tmp_path: Path) -> None:
+    folder = RunFolder(recorded("budget.steps=160", outcome="budget"))
+    assert gather(tmp_path).trainings[0].config["budget.steps"] == 160
+    tree = folder.config
+    folder.write_config({**tree, "budget": {**tree["budget"], "steps": 320}})
+    gathered = gather(tmp_path)
+    assert gathered.trainings == []
+    assert gathered.skipped[folder.name].startswith("unfinished: it was made longer")
+
+
+def test_players_are_there_whichever_trainings_are_asked_for(recorded: Recorded, tmp_path: Path) -> None:
+    recorded()
+    player = evaluated(tmp_path, tmp_path / "x", 2.0, 0.1).rename(tmp_path / "runs" / "random-Atlantis-v0")
+    (player / "config.json").write_text('{"agent": {"name": "random"}}')
+    result = {"outcome": "finished", "steps": 0, "counts": {}, "evaluation": {}, "report": ""}
+    (player / "result.json").write_text(json.dumps(result))
+    assert len(gather(tmp_path, ["nothing"]).players) == 1
+    assert gather(tmp_path, ["nothing"]).trainings == []
+
+
+def test_a_film_is_of_the_episodes_that_count(recorded: Recorded, tmp_path: Path) -> None:
+    folder = recorded(scores=(1.0,))
+    own, film = RunFolder(folder), folder / "artifacts" / "best_episode.mp4"
+    film.write_bytes(b"film")
+    assert gather(tmp_path).trainings[0].film is None  # nobody says of which evaluation it is
+    for step, shown in ((80, None), (160, film)):
+        journal = Journal(own.path)
+        journal.tags({"best_evaluation": f"mean 1 at step {step}"})
+        journal.finish()
+        assert gather(tmp_path).trainings[0].film == shown
+    later = evaluated(tmp_path, folder, 2.0, 0.1)
+    assert gather(tmp_path).trainings[0].film == later / "artifacts" / "best_episode.mp4"
+
+
 def test_runs_are_chosen_by_name_and_by_config(recorded: Recorded, tmp_path: Path) -> None:
     for model in ("cnn", "resnet"):
         for seed in (0, 1):
@@ -150,7 +185,13 @@ def test_runs_are_chosen_by_name_and_by_config(recorded: Recorded, tmp_path: Pat
     (one,) = select(everything, ["model=cnn", "seed=1"])
     assert (one.config["model.name"], one.config["seed"]) == ("cnn", 1)
     assert len(select(everything, ["replay.capacity=120", "env.max_pool=false"])) == 4
-    assert select(everything, ["seed=2"]) == []
+    with pytest.raises(ConfigError, match=r"^where=seed=2: no run has it; .*\(valid: 0, 1\)$"):
+        select(everything, ["seed=2"])
+    assert select([], ["seed=2"]) == []
+    rate = everything[0].config["optimizer.lr"]
+    assert (
+        len(select(everything, [f"optimizer.lr={rate:.9f}", f"optimizer.lr={rate:.9e}", "replay.capacity=1_20"])) == 4
+    )
     with pytest.raises(ConfigError, match="where=modle: no such key"):
         select(everything, ["modle=cnn"])
     with pytest.raises(ConfigError, match="write KEY=VALUE"):

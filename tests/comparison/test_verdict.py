@@ -458,6 +458,14 @@ def test_runs_that_were_not_trained_equally_long_are_named_unless_that_is_the_qu
     assert not any("equally long" in line for line in compared(runs, "model", "budget.steps").caveats)
 
 
+def test_evaluations_of_unequal_size_are_named() -> None:
+    runs = [*around("cnn", 3_000.0), *around("resnet", 5_000.0)]
+    assert not any("numbers of episodes" in line for line in compared(runs).caveats)
+    runs[0] = of("cnn", 0, (3_000.0,))
+    said = "different numbers of episodes, each by its latest evaluation: 1: cnn-uniform-s0; 4: cnn-uniform-s1, "
+    assert any(said in line for line in compared(runs).caveats)
+
+
 def test_who_leads_while_training_is_said_as_a_description() -> None:
     def curve(end: float) -> dict[str, Any]:
         return {"frames": np.array([0.0, 100.0]), "epsilon": np.zeros(2), "score": np.array([0.0, end])}

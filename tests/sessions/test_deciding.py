@@ -16,6 +16,7 @@ import pytest
 
 from atlantis_exp.commands.app import Asked
 from atlantis_exp.commands.compare import VERB as COMPARE
+from atlantis_exp.commands.compare import CompareConfig
 from atlantis_exp.commands.decide import DecideConfig, request_of
 from atlantis_exp.commands.overrides import check, swept
 from atlantis_exp.config import Config
@@ -230,6 +231,16 @@ def test_a_training_that_fails_ends_the_decision_in_one_line_that_says_how_it_go
     assert str(failed.value).startswith(f"run {run.name}: ")
     assert str(failed.value).endswith(f"; the decision goes on with: {session.request.command}")
     assert session.folder.status == "FAILED"
+
+
+def test_the_command_that_compares_is_read_as_it_is_meant(asking: Asking, tmp_path: Path) -> None:
+    session = asking("optimizer.lr=0.001,0.002", "baseline='lr=0.001'", "delta=1234567")
+    words = shlex.split(session.comparing)[4:]
+    (config,) = check("compare", CompareConfig, COMPARE.rewrite(words)).values()
+    assert config.question == session.request.question
+    assert config.question.delta == 1_234_567
+    assert config.at_epsilon == session.epsilon == 0.05
+    assert config.paths.outputs == str(tmp_path)
 
 
 @pytest.mark.slow
