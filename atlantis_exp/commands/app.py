@@ -46,7 +46,7 @@ class Verb(Generic[T]):
     name: str
     schema: type[T]
     work: Callable[[Asked[T]], Callable[[], object]]
-    """Imports what does the work, and returns the call that does it."""
+    """Imports what does the work, and returns the call that does it; an int that this returns is a late signal."""
     config_name: str = ""  # of the file under conf/; that of the verb unless it says otherwise
     rewrite: Callable[[list[str]], list[str]] = list
     """From arguments as people write them to Hydra's overrides. Raises: ConfigError."""
@@ -84,12 +84,14 @@ class Verb(Generic[T]):
             overrides = (*flags, *HydraConfig.get().overrides.task)
             try:
                 config = checked(self.schema, composed)
-                self.work(Asked(config, self.name, overrides, _job_launcher(), typed))()
+                late = self.work(Asked(config, self.name, overrides, _job_launcher(), typed))()
             except (Fault, OSError) as error:
                 # In a sweep an exit would take the other jobs along, an exception does not.
-                if is_sweep():
+                if _is_sweep():
                     raise
                 exit_with(error)
+            if isinstance(late, int) and _is_sweep():  # it came when this job had nothing left to stop
+                sys.exit(128 + late)
 
         sys.argv[1:] = arguments  # which Hydra reads
         os.environ.setdefault("HYDRA_FULL_ERROR", "1")
@@ -108,7 +110,7 @@ def exit_with(error: Exception) -> NoReturn:
     sys.exit(getattr(error, "exit_code", 1))
 
 
-def is_sweep() -> bool:
+def _is_sweep() -> bool:
     """Whether Hydra runs this job as one of several."""
     return HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN
 
@@ -117,7 +119,7 @@ def _job_launcher() -> str | None:
     """The launcher that this process does one job of a sweep for; None where that is Hydra's own, or there is none."""
     if (apart := job_apart()) is not None:
         return apart
-    if not is_sweep():
+    if not _is_sweep():
         return None
     name = str(HydraConfig.get().runtime.choices["hydra/launcher"])
     return None if Launcher(name).is_basic else name

@@ -1,11 +1,10 @@
 """`python -m atlantis_exp [train] overrides`: one run; the same command again continues or reports it."""
 
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 
-from atlantis_exp.commands.app import Asked, Verb, is_sweep
+from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.jobs import job_of
 from atlantis_exp.commands.overrides import swept
 from atlantis_exp.config import Config
@@ -19,11 +18,7 @@ def _work(asked: Asked[Config]) -> Callable[[], object]:
         case None:
             from atlantis_exp.sessions.training import train
 
-            def in_turn() -> None:
-                if (late := train(job)) is not None and is_sweep():  # a signal, when there was nothing left to stop
-                    sys.exit(128 + late)
-
-            return in_turn
+            return partial(train, job)
         case "joblib":
             from atlantis_exp.sessions.launchers.joblib import train_apart
 

@@ -83,7 +83,8 @@ def compare(
         print(f"atlantis_exp: left out {name}: {reason}", file=sys.stderr)
     trainings = select(gathered.trainings, where)
     if not trainings:
-        raise ConfigError(f"there is no finished training under {outputs / 'runs'} that compare was asked for")
+        none = f": none of {len(gathered.trainings)} has where={','.join(where)}" if gathered.trainings else ""
+        raise ConfigError(f"there is no finished training under {outputs / 'runs'} that compare was asked for{none}")
     refuse_mixed_protocols(trainings, question.by)
     groups = group(trainings, question.by)
     asked = families([group_of(members, question.by) for members in groups.values()], question)

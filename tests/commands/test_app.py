@@ -5,7 +5,6 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -13,25 +12,12 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from atlantis_exp.commands import VERBS
-from atlantis_exp.commands.app import Asked
 from atlantis_exp.commands.composing import checked
 from atlantis_exp.commands.overrides import check
-from atlantis_exp.commands.train import VERB
 from atlantis_exp.config import Config
 
 REPOSITORY = Path(__file__).parents[2]
 Command = Callable[..., int]
-
-
-@pytest.mark.parametrize(("late", "sweeps", "code"), [(None, True, None), (15, False, None), (15, True, 143)])
-def test_a_signal_at_the_end_of_a_run_ends_its_sweep(
-    monkeypatch: pytest.MonkeyPatch, tiny: Callable[..., Config], late: int | None, sweeps: bool, code: int | None
-) -> None:
-    monkeypatch.setattr("atlantis_exp.sessions.training.train", lambda _: late)
-    monkeypatch.setattr("atlantis_exp.commands.train.is_sweep", lambda: sweeps)
-    work = VERB.work(Asked(tiny(), "train", ()))
-    with nullcontext() if code is None else pytest.raises(SystemExit, match=f"^{code}$"):
-        work()
 
 
 HAS_MPS = torch.backends.mps.is_available()

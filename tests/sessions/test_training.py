@@ -613,6 +613,26 @@ def test_a_sweep_runs_what_is_missing_and_tables_what_it_found(
     assert f"starting run {missing.run_name()}" in done
 
 
+def test_a_signal_that_comes_when_a_run_has_nothing_left_to_stop_ends_its_sweep(
+    tiny_overrides: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained: list[int] = []
+
+    def train(job: Job) -> int:
+        trained.append(job.config.seed)
+        return signal.SIGTERM
+
+    monkeypatch.setattr("atlantis_exp.sessions.training.train", train)
+    monkeypatch.setattr(sys, "argv", ["atlantis_exp"])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    words = replaced(tiny_overrides, *SHORT, f"paths.outputs={tmp_path}", "seed=0,1")
+    with pytest.raises(SystemExit, match="143"):
+        VERB.run([*words, "-m"])
+    assert trained == [0]
+    VERB.run(replaced(words, "seed=2"))  # done, so what one is to do
+    assert trained == [0, 2]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "overrides",
