@@ -54,6 +54,12 @@ def absolute(key: str, text: str) -> Path:
         raise ConfigError(f"{key}={text}: there is no such user here, whose folder ~ would be") from None
 
 
+def check_new(key: str, folder: Path) -> None:
+    """Raise ConfigError where a folder that is to be filled is there already and not empty."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ConfigError(f"{key}={folder}: is not empty; name another folder")
+
+
 def check_server(key: str, uri: str | None) -> None:
     """Raise ConfigError where a key holds no server's address."""
     # It is written into files, which is no place for a password.

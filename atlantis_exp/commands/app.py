@@ -112,7 +112,7 @@ def exit_with(error: Exception) -> NoReturn:
 
 def _is_sweep() -> bool:
     """Whether Hydra runs this job as one of several."""
-    return HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN
+    return HydraConfig.get().mode is RunMode.MULTIRUN
 
 
 def _job_launcher() -> str | None:

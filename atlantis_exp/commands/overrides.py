@@ -23,6 +23,7 @@ from atlantis_exp.commands import CONF
 from atlantis_exp.commands.composing import admit, checked, composing
 from atlantis_exp.components import KINDS, admitted, installed
 from atlantis_exp.faults import ConfigError
+from atlantis_exp.sessions.job import quoted
 from atlantis_exp.sessions.launchers import BASIC, Launcher
 
 T = TypeVar("T")
@@ -294,7 +295,7 @@ def _located(match: re.Match[str]) -> str:
         reference = text.strip().strip("'\"")
         if "/" in reference or reference.endswith(".py"):
             reference = str(absolute("plugins", reference))
-        references.append(reference if re.fullmatch(r"[\w/.+-]+", reference, re.ASCII) else f"'{reference}'")
+        references.append(quoted(reference))
     return f"plugins=[{','.join(references)}]"
 
 

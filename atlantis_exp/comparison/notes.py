@@ -2,8 +2,9 @@
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 from atlantis_exp.comparison.gather import AXES, COMMIT, Training, resolve
 from atlantis_exp.comparison.published import Table, early_dqn, random_line
@@ -12,6 +13,8 @@ from atlantis_exp.components import Component, facts_of
 from atlantis_exp.decision import FEWEST_SEEDS, equal_scores
 from atlantis_exp.runs.folder import LOST
 from atlantis_exp.terminal import PROGRAM
+
+T = TypeVar("T")
 
 _NAMED = 6  # runs, up to which a line names them
 
@@ -75,10 +78,7 @@ def modes_found(facts: Facts) -> Iterator[str]:
 def different_makers(facts: Facts) -> Iterator[str]:
     """Precisions and devices, which do not enter a run's identity."""
     for tag, called in (("precision", "precisions"), ("device", "devices")):
-        holders = defaultdict(list)
-        for run in facts.trainings:
-            if tag in run.tags:
-                holders[run.tags[tag]].append(run.name)
+        holders = _holders((run.tags[tag], run.name) for run in facts.trainings if tag in run.tags)
         if len(holders) > 1:
             named = "; ".join(f"{value}: {_listed(names)}" for value, names in sorted(holders.items()))
             yield f"The runs were made in different {called}: {named}."
@@ -86,10 +86,8 @@ def different_makers(facts: Facts) -> Iterator[str]:
 
 def different_lengths(facts: Facts) -> Iterator[str]:
     """Budgets that ended trainings, which do not enter a run's identity either."""
-    holders = defaultdict(list)
-    for run in facts.trainings:
-        budget = run.config["budget.steps"]
-        holders["the whole plan" if budget is None else f"budget.steps={budget:,}"].append(run.name)
+    budgets = ((run.config["budget.steps"], run.name) for run in facts.trainings)
+    holders = _holders(("the whole plan" if most is None else f"budget.steps={most:,}", name) for most, name in budgets)
     if len(holders) > 1 and "budget.steps" not in facts.by:
         named = "; ".join(f"{length}: {_listed(names)}" for length, names in holders.items())
         yield f"The runs were not trained equally long: {named}."
@@ -97,9 +95,7 @@ def different_lengths(facts: Facts) -> Iterator[str]:
 
 def different_evaluations(facts: Facts) -> Iterator[str]:
     """Evaluations of unequal size, as a single later episode of one run."""
-    holders = defaultdict(list)
-    for run in facts.trainings:
-        holders[run.episodes.scores.size].append(run.name)
+    holders = _holders((run.episodes.scores.size, run.name) for run in facts.trainings)
     if len(holders) > 1:
         named = "; ".join(f"{size:,}: {_listed(names)}" for size, names in sorted(holders.items()))
         yield f"The runs were evaluated by different numbers of episodes, each by its latest evaluation: {named}."
@@ -283,6 +279,14 @@ NOTES: Sequence[Callable[[Facts], Iterator[str]]] = (
     other_players,
 )
 """What is said after it."""
+
+
+def _holders(values: Iterable[tuple[T, str]]) -> dict[T, list[str]]:
+    """Whose value is which: from pairs of a value and a run's name."""
+    holders = defaultdict(list)
+    for value, name in values:
+        holders[value].append(name)
+    return holders
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from atlantis_exp.checking import check_new
 from atlantis_exp.components import ENTRY_POINTS
-from atlantis_exp.faults import ConfigError
 from atlantis_exp.terminal import PROGRAM
 
 _MODEL = '''"""The network {name}."""
@@ -166,8 +166,7 @@ def test_it_keeps_every_contract() -> None:
 
 def begin(kind: str, name: str, folder: Path) -> None:
     """Write a package whose component plays, and say what to do with it. Raises: ConfigError."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigError(f"to={folder}: is not empty; name another folder")
+    check_new("to", folder)
     source, values = _CLASSES[kind]
     words = {
         "kind": kind,

@@ -4,7 +4,6 @@ The runs are ordinary ones, and the looks are those of `compare` over them, whos
 moment, the same command goes on where it was.
 """
 
-import re
 import subprocess
 import sys
 import tempfile
@@ -32,7 +31,7 @@ from atlantis_exp.media import run_colour
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal, Metrics, NullJournal, read
 from atlantis_exp.runs.provenance import provenance
-from atlantis_exp.sessions.job import Job, command_line, labels
+from atlantis_exp.sessions.job import Job, command_line, labels, quoted
 from atlantis_exp.sessions.sweep import ledger, terminable
 from atlantis_exp.sessions.training import expected, train
 from atlantis_exp.tracking.publishing import catch_up, publishing
@@ -176,9 +175,9 @@ class _Session:
             *("compare", f"by={','.join(question.by)}", f"runs={self.folder.name}", f"seeds={question.seeds}"),
             f"at_epsilon={self.epsilon}",
             *([f"delta={delta}"] if delta else []),
-            *([f"baseline={_quoted(question.baseline)}"] if question.baseline is not None else []),
+            *([f"baseline={quoted(question.baseline)}"] if question.baseline is not None else []),
             *([f"error={question.error}"] if question.error != Question.error else []),
-            f"paths.outputs={_quoted(str(self.outputs))}",
+            f"paths.outputs={quoted(str(self.outputs))}",
         )
 
     def job(self, label: str, seed: int) -> Job:
@@ -387,14 +386,6 @@ def _looks(comparison: Comparison) -> str:
     ]
     head = ["| look at seeds | pair | said | difference | interval | error spent |", f"|{' --- |' * 6}"]
     return "\n".join([*head, *rows]) if rows else ""
-
-
-def _quoted(value: str) -> str:
-    """A text as Hydra takes it, in quotes where it would read something else in it."""
-    if re.fullmatch(r"[\w./-]+", value, re.ASCII):
-        return value
-    escaped = value.replace("'", r"\'")
-    return f"'{escaped}'"
 
 
 def _metric(name: str) -> str:

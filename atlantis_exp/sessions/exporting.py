@@ -8,8 +8,8 @@ from typing import Literal
 
 from atlantis_exp import terminal
 from atlantis_exp.build import build_evaluator
+from atlantis_exp.checking import check_new
 from atlantis_exp.config import EvaluationConfig, PathsConfig
-from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.folder import RunFolder, find_run
 from atlantis_exp.runs.journal import Metrics, Tags
 from atlantis_exp.sessions.cards import Card, build_exported_actor, pack, portable, write_card
@@ -39,8 +39,7 @@ def export(
     catch_up(outputs)
     source = find_run(outputs, run)
     folder = Path(to or f"pretrained/{source.name}")
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigError(f"to={folder}: is not empty; name another folder")
+    check_new("to", folder)
     trained = portable(source.trained_config)
     stored, step = stored_weights(source, weights)
     packed, precision = pack(stored)

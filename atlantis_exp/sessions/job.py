@@ -1,5 +1,6 @@
 """One training as it was asked for: its config, what people call it, and the command that repeats it."""
 
+import re
 import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -58,6 +59,14 @@ def replaced(overrides: Iterable[str], *others: str) -> list[str]:
 def command_line(*arguments: str) -> str:
     """A command of ours as a shell takes it."""
     return " ".join((PROGRAM, *map(shlex.quote, arguments)))
+
+
+def quoted(value: str) -> str:
+    """A text as Hydra takes it, in quotes where it would read something else in it."""
+    if re.fullmatch(r"[\w/.+-]+", value, re.ASCII):
+        return value
+    escaped = value.replace("'", r"\'")
+    return f"'{escaped}'"
 
 
 def config_colour(config: Config) -> str:

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from shlex import quote
 
 from atlantis_exp import terminal
 from atlantis_exp.config import TrackingConfig
@@ -82,7 +83,10 @@ def catch_up(outputs: Path, server: str | None = None, continued: Path | None = 
             if not Publisher(folder.path, store).drain(_DRAIN_SECONDS):
                 unreachable.add(store.address)
     for uri, runs in left.items():
-        print(f"atlantis_exp: {uri} lacks parts of {runs} runs; {PROGRAM} sync to={uri} sends them", file=sys.stderr)
+        print(
+            f"atlantis_exp: {uri} lacks parts of {runs} runs; {PROGRAM} sync {quote(f'to={uri}')} sends them",
+            file=sys.stderr,
+        )
 
 
 def how_to_open(outputs: Path) -> str:

@@ -47,7 +47,7 @@ from atlantis_exp.tracking.views import experiment_tags
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-    from mlflow.entities import LoggedModel, Metric
+    from mlflow.entities import LoggedModel, Metric, Run
     from mlflow.store.artifact.mlflow_artifacts_repo import MlflowArtifactsRepository
     from mlflow.store.entities import PagedList
 
@@ -57,6 +57,8 @@ _log = logging.getLogger(__name__)
 
 PLACE = r"([a-z]+)/[A-Za-z0-9][A-Za-z0-9_.,~+=@-]{0,199}"
 """What a run's folder is called under an outputs folder."""
+PARENT = rf"\.\./\.\./{PLACE}"
+"""How a run's folder names the one that it is shown under."""
 
 DATABASE = "mlflow.db"
 """The local store, in an outputs folder."""
@@ -182,16 +184,17 @@ class Store:
         name = commit.labels.get(_RUN_NAME, folder.name)
         return str(self.client.create_run(self.experiment_id, commit.started, tags, name).info.run_id)
 
-    def has_run(self, run_id: str) -> bool:
-        """Returns whether a run is there and was not deleted."""
+    def run(self, run_id: str) -> "Run | None":
+        """Returns a run, None where it is not there or was deleted."""
         from mlflow.exceptions import MlflowException
 
         try:
-            return bool(self.client.get_run(run_id).info.lifecycle_stage == "active")
+            run = self.client.get_run(run_id)
         except MlflowException as error:
             if error.error_code != "RESOURCE_DOES_NOT_EXIST":
                 raise
-            return False
+            return None
+        return run if run.info.lifecycle_stage == "active" else None
 
     def delete_run(self, run_id: str) -> None:
         """Deletes a run and its models, which MLflow would keep."""
@@ -407,10 +410,11 @@ def publish(folder: Path, store: Store, is_primary: bool = True) -> bool:
         cursor = Cursor.of(note, folder, store, commit)
         if cursor.files == files_digest(files):
             return False
-        if not store.has_run(cursor.run_id):  # somebody has deleted it, and here it went on
+        if (run := store.run(cursor.run_id)) is None:  # somebody has deleted it, and here it went on
             Cursor(store.address, commit.identity).save(note)
             cursor = Cursor.of(note, folder, store, commit)
-        mirror = _Mirror(folder, store, cursor.run_id)
+            run = store.client.get_run(cursor.run_id)
+        mirror = _Mirror(folder, store, run)
         if not store.is_local:
             mirror.send_journal(cursor.offset, commit.offset)
         points: list[Metric] = []
@@ -472,7 +476,7 @@ def brought(folder: Path) -> "Cursor | None":
 
 def _parent_run(folder: Path, store: Store, commit: Commit, is_primary: bool) -> str | None:
     """The run that a folder's is shown under, which is published if it is not yet there."""
-    if not re.fullmatch(rf"\.\./\.\./{PLACE}", commit.parent):
+    if not re.fullmatch(PARENT, commit.parent):
         return None
     parent = (folder / commit.parent).resolve()
     if not parent.exists():
@@ -524,14 +528,13 @@ _CURSOR = TypeAdapter(Cursor)
 class _Mirror:
     """Sends records of one folder to one run; every method may be repeated."""
 
-    def __init__(self, folder: Path, store: Store, run_id: str) -> None:
+    def __init__(self, folder: Path, store: Store, run: "Run") -> None:
         self._journal = folder / "journal.jsonl"
         self._artifacts = folder / "artifacts"
         self._traceback = folder / TRACEBACK
         self._client = store.client
         self._experiment_id = store.experiment_id
-        self._run_id = run_id
-        run = self._client.get_run(run_id)
+        self._run_id = run.info.run_id
         self._name = run.info.run_name
         self._latest = {point.key: point.timestamp for point in run.data._metric_objs}
 

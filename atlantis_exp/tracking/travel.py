@@ -30,6 +30,7 @@ from atlantis_exp.tracking.store import (
     CHUNK,
     FILES_TAG,
     ORIGIN,
+    PARENT,
     PLACE,
     SMALL_FILES,
     TRAVELS,
@@ -154,7 +155,7 @@ def _check_parent(folder: Path, parent: str) -> None:
     """Refuse a parent that is no run folder's place, or that is shown under the folder itself."""
     place = folder = Path(os.path.normpath(folder))
     while parent:
-        if not re.fullmatch(rf"\.\./\.\./{PLACE}", parent):
+        if not re.fullmatch(PARENT, parent):
             raise ValueError(f"its parent {parent!r} is no run folder's place")
         place = Path(os.path.normpath(place / parent))
         if place == folder:

@@ -360,6 +360,9 @@ def test_a_folder_that_names_a_server_is_not_sent_there_with_the_password(
     monkeypatch.setattr("atlantis_exp.tracking.publishing._DRAIN_SECONDS", 0.5)
     catch_up(tmp_path, uri)
     assert asked
+    (run / "published.json").write_text(json.dumps({"store": "http://h/$(x)#atlantis", "identity": "x"}))
+    catch_up(tmp_path, uri)
+    assert "sync 'to=http://h/$(x)' sends them" in capsys.readouterr().err
 
 
 def test_pieces_of_a_journal_may_have_been_sent_again_from_its_beginning() -> None:
