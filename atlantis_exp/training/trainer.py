@@ -13,14 +13,13 @@ from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.game.vector import Emulators, Steps
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.replay.memory import ReplayMemory
-from atlantis_exp.replay.samplers import Sampler
+from atlantis_exp.replay.samplers import Draw, Sampler
 from atlantis_exp.training.actor import Actor, Decisions
 from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.plan import Counters, Plan, passed
 from atlantis_exp.training.recorder import Played, Recorder
 
 Outcome = Literal["finished", "budget", "interrupted"]
-Draw = tuple[Sampler, npt.NDArray[np.int64], npt.NDArray[np.floating] | None]  # ids and weights (B,) of a batch
 
 
 class Trainer:
@@ -68,13 +67,14 @@ class Trainer:
         overlap = self.emulators.num_envs > 1  # learn while they play
         self._begin(stop)
         while not self.has_ended and not stop():
+            sampler = self.plan.phase_at(self.counters).sampler
             self.learner.learning_rate = self.plan.learning_rate_at(self.counters)
             epsilon = self.plan.epsilon_at(self.counters)
             decisions = self.actor.act(self.stack.state, epsilon, self.exploration)
             self.emulators.send(decisions.actions)
             if not overlap:
                 steps = self._observe(decisions)
-            for sampler, ids, weights in self._due_batches():
+            for ids, weights in self._due_batches(sampler):
                 errors = self.learner.update(*self.memory.gather(ids, self.plan.returns), weights)
                 if weights is not None:
                     self._errors.append((sampler, ids, errors))
@@ -143,16 +143,15 @@ class Trainer:
         for row, env in enumerate(envs):
             self.memory.begin(env, observations[row])
 
-    def _due_batches(self) -> Iterator[Draw]:
+    def _due_batches(self, sampler: Sampler) -> Iterator[Draw]:
         """Draw a batch for each update that has fallen due."""
         due = self.counters.steps // self.plan.learn_every - self.counters.learn_ticks
         self.counters.learn_ticks += due
         if len(self.memory) <= self.plan.learn_start:
             return
         self._feed_back()
-        sampler = self.plan.phase_at(self.counters).sampler
         for _ in range(due):
-            yield sampler, *sampler.sample(self.memory, self.plan.batch_size, self.sampling)
+            yield sampler.sample(self.memory, self.plan.batch_size, self.sampling)
 
     def _feed_back(self) -> None:
         """Report earlier TD errors to their samplers; the actor has already synchronised the device."""
