@@ -232,26 +232,44 @@ def test_a_copy_follows_a_run_that_went_back_behind_what_was_sent(tmp_path: Path
 def test_a_bringing_that_breaks_off_anywhere_is_made_good(
     tmp_path: Path, server: tuple[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (address, _), cluster, laptop = server, tmp_path / "cluster", tmp_path / "laptop"
-    options = (f"from={address}", "tracking.experiment=broken")
-    run = a_sweep_of_one(cluster, "broken")
-    synced(cluster, f"to={address}", "tracking.experiment=broken")
-    attempts = 0
-    for fails_at in range(20):
-        attempts, writes = attempts + 1, iter(range(20))
+    (address, behind), cluster, laptop = server, tmp_path / "cluster", tmp_path / "laptop"
+    experiment = "tracking.experiment=broken"
+    run, copy = a_sweep_of_one(cluster, "broken"), laptop / "runs/broken"
+    synced(cluster, f"to={address}", experiment)
 
-        def write_or_fail(path: Path, content: bytes, fails_at: int = fails_at, writes: Iterator[int] = writes) -> None:
-            if next(writes) >= fails_at:
-                raise ValueError(f"no {path}")
-            write_file(path, content)
+    def attempts(before: Commit | None) -> int:
+        """How many it takes where each fails at one more file."""
+        for fails_at in range(20):
+            writes = iter(range(20))
 
-        monkeypatch.setattr(travel, "write_file", write_or_fail)
-        try:
-            synced(laptop, *options)
-            break
-        except Fault:
-            assert read_commit(laptop / "runs/broken") in (None, read_commit(run))
-    assert attempts == 7  # the sweep has a file and its commit, the run three, config, result and commit
+            def write_or_fail(path: Path, content: bytes, fails_at: int = fails_at, writes: Any = writes) -> None:
+                if next(writes) >= fails_at:
+                    raise ValueError(f"no {path}")
+                write_file(path, content)
+
+            with monkeypatch.context() as patched:
+                patched.setattr(travel, "write_file", write_or_fail)
+                try:
+                    synced(laptop, f"from={address}", experiment)
+                    return fails_at + 1
+                except Fault:
+                    assert read_commit(copy) in (before, read_commit(run))
+            if copy.exists():
+                publish(copy, Store(laptop, "broken", address), is_primary=False)
+                assert shown(behind, "broken") == sent
+        raise AssertionError("it never came to an end")
+
+    sent = shown(behind, "broken")
+    assert attempts(None) == 7  # the sweep has a file and its commit, the run three, config, result and commit
+    assert contents(laptop) == contents(cluster)
+
+    journal, commit = Journal(run), read_commit(run)
+    assert commit is not None
+    journal.load_state_dict({"offset": commit.offset, "time": commit.updated})
+    grow(journal, 5)
+    synced(cluster, f"to={address}", experiment)
+    sent = shown(behind, "broken")
+    assert attempts(commit) == 7
     assert contents(laptop) == contents(cluster)
 
 
@@ -262,10 +280,11 @@ def test_what_a_server_says_leads_nowhere_outside(
     store = Store(tmp_path, "forged", server[0])
     line = b'{"kind":"artifact","path":"%s"}\n'
 
-    def forge(folder: str, parent: str = "", path: bytes = b"a.txt") -> None:
+    def forge(folder: str, parent: str = "", path: bytes = b"a.txt", offset: int | None = None) -> None:
         """Make a run on the server as if a folder had been published."""
         journal = line % path
-        files = {"commit.json": commit_bytes(Commit("x", 1, 2, len(journal), "FINISHED", parent=parent))}
+        commit = Commit("x", 1, 2, len(journal) if offset is None else offset, "FINISHED", parent=parent)
+        files = {"commit.json": commit_bytes(commit)}
         run = store.client.create_run(store.experiment_id, tags={"atlantis.folder": folder}).info.run_id
         for name, content in {**files, "journal/000000000000.gz": gzip.compress(journal)}.items():
             (aside := tmp_path / Path(name).name).write_bytes(content)
@@ -279,13 +298,15 @@ def test_what_a_server_says_leads_nowhere_outside(
     forge("/home/x/runs/far", parent="../../../etc/passwd")
     forge("/home/x/runs/path", path=b"../../../away")
     forge("/home/x/runs/absolute", path=b"/tmp/away")
+    forge("/home/x/runs/endless", offset=2**30 + 1)
     forge("/home/x/runs/fine")
-    with pytest.raises(Fault, match="7 of 8 runs failed"):
+    with pytest.raises(Fault, match="8 of 9 runs failed"):
         synced(laptop, f"from={server[0]}", "tracking.experiment=forged")
     said = capsys.readouterr().err
     assert said.count("no run folder's place") == 4
     assert said.count("does not name a file inside") == 2
     assert said.count("its own parent") == 1
+    assert said.count("its journal of 1,073,741,825 bytes is longer than 1,073,741,824") == 1
     assert "runs/fine/commit.json" in contents(laptop)
     assert not list(tmp_path.rglob("away"))
     assert {path.name for path in laptop.iterdir()} == {"runs", "mlflow.lock"}
