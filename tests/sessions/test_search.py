@@ -24,6 +24,7 @@ from atlantis_exp.runs.journal import Metrics, Tags, read, read_commit
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.stopping import StopRequest
 from atlantis_exp.sessions.training import train
+from atlantis_exp.training.trainer import Trainer
 
 pytest.importorskip("optuna", reason="needs pip install 'atlantis-exp[search]'")
 
@@ -99,6 +100,21 @@ def test_a_search_trains_its_trials_under_a_run_of_its_own_and_goes_on_where_mor
     page = read_commit(session.folder.path)
     assert page is not None
     assert page.status == "FINISHED"
+
+
+def test_a_signal_that_comes_when_a_trial_has_nothing_left_to_stop_ends_the_search_after_it(
+    searching: Searching, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def trained(job: Job, watch: Callable[[Trainer], bool]) -> int:
+        assert train(job, watch) is None
+        return signal.SIGTERM
+
+    monkeypatch.setattr("atlantis_exp.sessions.search.train", trained)
+    request = searching("trials=2", space=SPACE[1:])
+    with pytest.raises(SystemExit, match="143"):
+        search(request)
+    assert capsys.readouterr().err.endswith(f"SIGTERM: the search goes on with: {request.command}\n")
+    assert [trial.state.name for trial in _open(request).trials] == ["COMPLETE"]
 
 
 def test_a_trial_that_nobody_holds_goes_on_before_a_new_one_is_drawn(searching: Searching) -> None:
