@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from atlantis_exp.comparison.published import curves
+from atlantis_exp.components import game_of
 from atlantis_exp.runs.folder import RunFolder, all_runs, evaluation_at
 from atlantis_exp.statistics import interquartile_mean
 
@@ -31,6 +33,17 @@ def test_a_kept_run_is_still_the_run_of_its_config_and_in_the_table_of_its_page(
     assert len(scores) == 100
     row = rf"^\| {run.trained_config.seed} \|.* {scores.mean():,.0f} \({interquartile_mean(scores):,.0f}\) \|"
     assert re.search(row, (DOCS / PAGES[page]).read_text(), re.MULTILINE)
+
+
+def test_published_curves_are_quoted_as_they_are() -> None:
+    text = " ".join((DOCS / "results.md").read_text().split())
+    means = {(row["name"], row["frames"]): row["mean"] for row in curves(game_of("Atlantis-v0"))}
+    for name, words in (
+        ("DreamerV3", "DreamerV3"),
+        ("QR-DQN Impala ResNet", "QR-DQN with Impala's residual network"),
+        ("QR-DQN Nature CNN", "QR-DQN with the Nature network"),
+    ):
+        assert f"{words} {means[name, 4e6]:,.0f} and {means[name, 5e6]:,.0f}" in text
 
 
 def test_a_run_that_is_kept_compares_as_it_did_and_names_no_place(

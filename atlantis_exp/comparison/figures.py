@@ -196,8 +196,21 @@ def thousands(axis: Any) -> None:
 
 
 def _legend(axes: "Axes", columns: int = 2) -> None:
-    if axes.get_legend_handles_labels()[0]:
-        axes.figure.legend(loc="outside upper left", ncols=columns, fontsize=8, columnspacing=1)
+    """Name what is drawn above the axes, in as many columns as fit, and make the figure higher by that."""
+    if not axes.get_legend_handles_labels()[0]:
+        return
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
+    for number in range(columns, 0, -1):
+        legend = figure.legend(loc="outside upper left", ncols=number, fontsize=7.5, columnspacing=1)
+        extent = legend.get_window_extent(renderer)
+        if extent.width <= figure.bbox.width or number == 1:
+            figure.set_figheight(figure.get_figheight() + extent.height / figure.dpi)
+            return
+        legend.remove()
 
 
 def _reference_lines(draw_line: Callable[..., Any], comparison: Comparison, low: float, high: float) -> None:
@@ -227,17 +240,11 @@ def _learning(axes: "Axes", comparison: Comparison, axis: str, rows: Table) -> N
         for run in dict.fromkeys(row["run"] for row in seeds if row["group"] == group):
             points = [(row["x"], row["score"]) for row in seeds if row["run"] == run]
             axes.plot(*zip(*points, strict=True), linewidth=0.6, alpha=0.6, **look)
-    if axis == "frames":
-        curves = defaultdict(list)
-        for row in comparison.tables["published_curves"]:
-            curves[row["name"]].append((row["frames"], row["mean"]))
-        for name, points in curves.items():
-            axes.plot(
-                *zip(*points, strict=True), color="#8c8c8c", marker=".", linewidth=0.8, label=f"{name}, published"
-            )
     scores = [row["score"] for row in (*rows, *seeds)]
     _reference_lines(axes.axhline, comparison, min(scores), max(scores))
     axes.set_ylim(0 if min(scores) >= 0 else None, None)
+    if axis == "frames":
+        _published(axes, comparison.tables["published_curves"])
     axes.set_xlabel(_UNITS[axis])
     axes.set_ylabel("training score, mean of 100")
     axes.locator_params(axis="x", nbins=5)
@@ -245,6 +252,19 @@ def _learning(axes: "Axes", comparison: Comparison, axis: str, rows: Table) -> N
         thousands(axes.xaxis)
     thousands(axes.yaxis)
     _legend(axes)
+
+
+def _published(axes: "Axes", rows: Table) -> None:
+    """Published curves in grey, by marks; they leave the picture rather than make it more than twice as high."""
+    curves = defaultdict(list)
+    for row in rows:
+        curves[row["name"]].append((row["frames"], row["mean"]))
+    low, high = axes.get_ylim()
+    for (name, points), mark in zip(curves.items(), cycle("os^vDP*X"), strict=False):
+        look: dict[str, Any] = {"color": "#8c8c8c", "marker": mark, "markersize": 4, "linewidth": 0.8}
+        axes.plot(*zip(*points, strict=True), label=f"{name}, published", **look)
+    bottom = low if low == 0 else max(axes.get_ylim()[0], 2 * low - high)
+    axes.set_ylim(bottom, min(axes.get_ylim()[1], 2 * high - low))
 
 
 def _exploration(axes: "Axes", comparison: Comparison, rows: Table) -> None:

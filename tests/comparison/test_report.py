@@ -183,6 +183,19 @@ def test_figures_are_pictures_of_something_and_take_on_the_pages_ink(figures: di
     assert "cnn 1,673" in figures["scores"].alt
 
 
+def test_published_curves_leave_the_picture_rather_than_flatten_what_was_trained_and_no_name_is_cut_off(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    recorded(curve=[(0, 0, 0, 4_000), (12_000_000, 9, 9, 9_000)])  # where others have 866,604
+    gathered = gather(tmp_path)
+    figure = draw(compare(gathered, group(gathered.trainings, ["model"]), Question(["model"])))["learning_frames"]
+    assert all(f"{name}, published" in figure.svg for name in ("QR-DQN Impala ResNet", "DreamerV3", "PPO"))
+    assert set(re.findall(r">(\d+k)<", figure.svg)) <= {f"{number}k" for number in range(31)}
+    pixels = np.asarray(Image.open(io.BytesIO(figure.png)).convert("RGB"))
+    assert (pixels[:, [0, -1]] == 255).all()
+    assert (pixels[[0, -1]] == 255).all()
+
+
 @pytest.mark.slow
 def test_the_same_comparison_draws_the_same_figures(comparison: Comparison) -> None:
     def content(figures: dict[str, Drawn]) -> list[tuple[str, bytes]]:

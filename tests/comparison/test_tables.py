@@ -256,7 +256,7 @@ def test_early_scores_below_random_come_with_the_reason(compared: Callable[..., 
     assert "At 5 M frames published DQN scores 7,433 to 8,341, below the random player's 12,850" in early_dqn(ATLANTIS)
 
 
-def test_a_late_curve_has_the_published_ones_beside_it_and_no_excuse(compared: Callable[..., Comparison]) -> None:
+def test_a_late_curve_has_the_published_ones_next_to_it_and_no_excuse(compared: Callable[..., Comparison]) -> None:
     comparison = compared(curve=((0, 0, 0, 0), (12_000_000, 9, 9, 9_000)))
     assert early_dqn(ATLANTIS) not in comparison.notes
     assert {row["frames"] for row in comparison.tables["published_curves"]} == {1e6 * n for n in range(1, 11)}
@@ -274,7 +274,8 @@ def test_what_is_published_has_a_protocol_and_a_source() -> None:
     assert published["DQN (Nature)"]["points_per_frame"] == pytest.approx(4.76, abs=0.01)  # five minutes
     assert isnan(published["GDI-H3"]["points_per_frame"])  # whose cap nobody knows
     assert len({frozenset(row) for row in rows}) == 1
-    assert all(row["source"] and row["seeds"] == 5 for row in curves(ATLANTIS))
+    assert all(row["source"] and row["seeds"] in (4, 5) for row in curves(ATLANTIS))
+    assert all(row["low"] <= row["mean"] <= row["high"] for row in curves(ATLANTIS))
 
 
 def test_a_table_survives_csv(compared: Callable[..., Comparison]) -> None:
