@@ -337,9 +337,12 @@ def build_evaluator(env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig) -> Eva
 
 
 def build_memory(config: cfg.Config) -> ReplayMemory:
-    """An empty replay memory."""
+    """An empty replay memory. Raises: ConfigError where this machine cannot reserve it."""
     env, replay = config.env, config.replay
-    return ReplayMemory(replay.capacity, (env.size, env.size), stack=env.stack, budget_bytes=replay.max_bytes)
+    try:
+        return ReplayMemory(replay.capacity, (env.size, env.size), stack=env.stack, budget_bytes=replay.max_bytes)
+    except MemoryError:
+        raise ConfigError(f"replay.max_bytes={replay.max_bytes}: more than this machine can reserve") from None
 
 
 def build_cadence(evaluation: cfg.EvaluationConfig, tracking: cfg.TrackingConfig) -> Cadence:

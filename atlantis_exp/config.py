@@ -74,6 +74,8 @@ class EnvConfig:
             raise ConfigError(
                 f"env.frameskip={list(self.frameskip)}: drawn from [low, high), so low must be under high"
             )
+        if self.noop_max >= self.max_frames:
+            raise ConfigError(f"env.noop_max={self.noop_max}: leaves nothing of env.max_frames={self.max_frames}")
         if self.max_pool and (isinstance(self.frameskip, tuple) or self.frameskip < 2):
             raise ConfigError(
                 "env.max_pool=true: needs one fixed env.frameskip of at least 2, as in env=atlantis_standard"

@@ -146,6 +146,7 @@ class Mine:
     [
         (GAME.format(name="breakut"), "breakut: ALE has no ROM of that name"),
         (GAME.format(name="pong"), "should be ALE's, ('NOOP', 'FIRE', 'RIGHT', 'LEFT', 'RIGHTFIRE', 'LEFTFIRE')"),
+        (GAME.format(name="pooyan"), "pooyan: its screen is (220, 160) pixels; only (210, 160) can be played"),
         (GAME.format(name="atlantis"), "env=atlantis is built in and is not replaced"),
         (GAME.format(name="atlantis_v5"), "env=atlantis_v5 is one of our presets and is not replaced"),
         (re.sub("    actions.*\n", "", GAME.format(name="pong")), "actions: missing; write actions = "),

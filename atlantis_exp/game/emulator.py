@@ -28,11 +28,13 @@ class Step(NamedTuple):
 
 
 def check_game(game: Game) -> None:
-    """Raise ConfigError where ALE has no such ROM, or other actions for it."""
+    """Raise ConfigError where ALE has no such ROM, or another screen or other actions for it."""
     if game.rom not in get_all_rom_ids():
         raise ConfigError(f"{game.rom}: ALE has no ROM of that name")
     ale = ALEInterface()
     ale.loadROM(cast(Path, get_rom_path(game.rom)))
+    if (screen := ale.getScreenDims()) != (playable := (SCREEN_HEIGHT, SCREEN_WIDTH)):
+        raise ConfigError(f"{game.rom}: its screen is {screen} pixels; only {playable} can be played")
     if (actions := tuple(action.name for action in ale.getMinimalActionSet())) != game.actions:
         raise ConfigError(f"{game.rom}: actions = {game.actions}: should be ALE's, {actions}")
 

@@ -112,7 +112,7 @@ class Learner(ActionValues):
         total, *others = gradients
         for other in others:
             torch._foreach_add_(total, other)
-        for parameter, gradient in zip(self.network.parameters(), total, strict=True):
+        for parameter, gradient in zip(_learned(self.network), total, strict=True):
             parameter.grad = gradient
         self._measure(torch.stack(means).sum(0))
         self.optimizer.step()
@@ -157,7 +157,10 @@ class Learner(ActionValues):
         loss = (losses * importance).sum() / batch_size
         online.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        gradients = [parameter.grad.float() for parameter in online.parameters() if parameter.grad is not None]
+        gradients = [
+            torch.zeros_like(parameter, dtype=torch.float32) if parameter.grad is None else parameter.grad.float()
+            for parameter in _learned(online)
+        ]
         q, share = q.detach(), len(a_t) / batch_size
         means = torch.stack((loss.detach(), share * q.mean(), share * target.mean()))
         return gradients, means, td_errors(q, actions, target)
@@ -276,6 +279,11 @@ class Learner(ActionValues):
             for role, network in (("network", self.network), ("target", self.target))
             for name, generator in generators_of(network)
         }
+
+
+def _learned(network: nn.Module) -> list[nn.Parameter]:
+    """The parameters that are not frozen."""
+    return [parameter for parameter in network.parameters() if parameter.requires_grad]
 
 
 @torch.no_grad()

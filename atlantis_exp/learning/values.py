@@ -49,7 +49,8 @@ class Replicas:
         self.networks = [
             copy.deepcopy(
                 network,
-                {id(each): each for each in shared} | {key: nn.Parameter(weight) for key, weight in weights.items()},
+                {id(each): each for each in shared}
+                | {id(each): nn.Parameter(weights[id(each)], each.requires_grad) for each in network.parameters()},
             )
             for _ in range(count)
         ]
@@ -111,5 +112,7 @@ class ActionValues:
 
     def _sent(self, array: npt.NDArray[Any]) -> torch.Tensor:
         tensor = torch.from_numpy(array)
+        if self.device.type != "cuda":
+            return tensor.to(self.device)
         # From memory that may be paged out, a copy to a GPU waits for all that was asked of the GPU before.
-        return tensor.pin_memory().to(self.device, non_blocking=True) if self.device.type == "cuda" else tensor
+        return tensor.pin_memory().to(self.device, non_blocking=True)

@@ -37,6 +37,7 @@ class FrameStore:
                 f"a replay budget of {budget_bytes:,} bytes does not hold {capacity:,} index entries "
                 f"and eight incompressible {frame_shape} frames"
             )
+        self._ring_bytes = min(self._ring_bytes, max(8, capacity) * self.max_length)  # more is never used
         self._buffer = np.empty(self._ring_bytes + self.max_length, np.uint8).data
         self.clear(0, b"")
 

@@ -12,6 +12,7 @@ from atlantis_exp.replay.memory import ReplayMemory
 
 Probability = Annotated[float, Interval(ge=0, le=1)]
 
+_MOST_ERROR = 1e30  # so that the sum of all priorities is finite
 _LEAST_ERROR = 1e-6  # added to every error, so that each transition may come again
 
 
@@ -116,8 +117,8 @@ class PrioritizedSampler:
 
     def feed_back(self, ids: npt.NDArray[np.int64], errors: npt.NDArray[np.float32]) -> None:
         """Give transitions that were drawn the priorities of their errors."""
-        # A NaN priority would make `_find` loop forever.
-        priorities = (np.nan_to_num(errors.astype(np.float64)) + _LEAST_ERROR) ** self.alpha
+        # A priority that is no number, or a sum that is infinite, would make `_find` loop forever.
+        priorities = (np.nan_to_num(errors.astype(np.float64), posinf=_MOST_ERROR) + _LEAST_ERROR) ** self.alpha
         self._set(ids % self._capacity, priorities)
         self._highest = max(self._highest, float(priorities.max()))
 

@@ -217,13 +217,13 @@ def evaluate(
     under_way: deque[tuple[range, npt.NDArray[np.int64], Decisions]] = deque()  # each with the half that it is of
     over = 0  # episodes
 
-    def begin(env: int) -> None:
-        index = next(waiting, None)
-        if index is None:
+    def begin(envs: Sequence[int]) -> None:
+        for env in envs:
             playing.pop(env, None)
-        else:
-            playing[env] = index
-            stacks.reset([env], emulators.reset([env], [played[index].seed]))
+        begun = dict(zip(envs, waiting, strict=False))  # until no episode is left
+        playing.update(begun)
+        if begun:
+            stacks.reset([*begun], emulators.reset([*begun], [played[index].seed for index in begun.values()]))
 
     def decide(half: range) -> None:
         envs = np.array([env for env in half if env in playing])
@@ -232,8 +232,7 @@ def evaluate(
             emulators.send(decisions.actions, envs)
             under_way.append((half, envs, decisions))
 
-    for env in range(min(emulators.num_envs, episodes)):
-        begin(env)
+    begin(range(emulators.num_envs))
     for first in (0, 1):
         decide(range(first, emulators.num_envs, 2))
     while under_way:
@@ -242,6 +241,7 @@ def evaluate(
         half, envs, decisions = under_way.popleft()
         steps = emulators.receive()
         stacks.push(steps.observations, envs)
+        ended = []
         for row, env in enumerate(envs.tolist()):
             episode = played[playing[env]]
             episode.actions.append(int(decisions.actions[row]))
@@ -258,8 +258,9 @@ def evaluate(
             episode.frames += int(steps.frames[row])
             if steps.terminated[row] or steps.truncated[row]:
                 episode.truncated = bool(steps.truncated[row])
-                over += 1
-                begin(env)
+                ended.append(env)
+        over += len(ended)
+        begin(ended)
         decide(half)
         on_step(played, over)
     return Evaluation(epsilon, played, game)

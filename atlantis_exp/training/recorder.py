@@ -155,18 +155,23 @@ class Recorder:
             self.progress.show(self._snapshot(counters))
 
     def evaluate(self, counters: Counters, num_envs: int, has_ended: bool, stop: Stop) -> None:
-        """Evaluate this step's network, unless that is done, and keep its weights; pending where it is stopped."""
+        """Evaluate this step's network, unless that is done, and keep its weights; pending where it is stopped.
+
+        Raises: Diverged.
+        """
         step = counters.steps
         if (every := self.cadence.evaluate_steps) and not has_ended:
             # As with the curves: one that fell due on the way to this step belongs to where it fell due. The last one
             # belongs to the run's last step, where a comparison looks for it.
             due = step - step % every
             step = due if step - due < num_envs else step
-        if step == self.evaluated_at:
+        episodes = self.cadence.final_episodes if has_ended else self.cadence.interim_episodes
+        # A run that goes on from an evaluation may end there, and then owes a longer one.
+        if step == self.evaluated_at and self.last_metrics["evaluation/episodes"] >= episodes:
             return
+        self.refuse_divergence()
         self.evaluation_pending = True
         try:
-            episodes = self.cadence.final_episodes if has_ended else self.cadence.interim_episodes
             with self._pace.paused():
                 evaluation = self._evaluate(episodes, self.progress, stop)
                 is_best = evaluation.summary.mean > self.best_mean

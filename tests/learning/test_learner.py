@@ -716,3 +716,33 @@ def test_rmsprop_is_the_dqn_paper_s_within_30_percent(scale: float) -> None:
         papers = -summed / np.sqrt(square - mean**2 + 0.01)
         ratio = (parameter.detach().numpy() - before) / papers
         assert np.all((ratio > 0.5**0.5 - 0.01) & (ratio < 1.01))
+
+
+def test_batches_go_where_the_network_is_on_any_device() -> None:
+    learner = _learner(DQNCnn)
+    learner.device = torch.device("meta")  # which is no CPU and no CUDA device, as Apple's is
+    assert learner._sent(np.zeros(3, np.float32)).device.type == "meta"
+
+
+@every_precision
+@pytest.mark.parametrize("shards", [1, 2])
+def test_a_frozen_layer_stays_as_it_is_and_the_others_learn(precision: Precision, shards: int) -> None:
+    network, target = _networks(DQNCnn)
+    first, *others = network.parameters()
+    first.requires_grad_(False)
+    before = copy.deepcopy([first, *others])
+    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3)
+    Learner(network, target, optimizer, DQN(), 0.1, precision=precision, shards=shards).update(*_batch(_SIDE[DQNCnn]))
+    moved = [not torch.equal(old, new) for old, new in zip(before, network.parameters(), strict=True)]
+    assert moved == [False, *(True for _ in others)]
+
+
+def test_a_layer_that_nothing_asks_learns_nothing() -> None:
+    network, target = _networks(DQNCnn)
+    unused = nn.Linear(3, 2)
+    network.add_module("unused", unused)
+    target.add_module("unused", copy.deepcopy(unused))
+    before = copy.deepcopy(unused.weight)
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
+    Learner(network, target, optimizer, DQN(), 0.1).update(*_batch(_SIDE[DQNCnn]))
+    assert torch.equal(before, unused.weight)

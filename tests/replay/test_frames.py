@@ -60,6 +60,14 @@ def test_the_ring_fills_to_its_last_byte_and_no_further(ring_bytes: int, held: i
     assert store.next_id - store.oldest_id == held
 
 
+def test_a_generous_budget_reserves_what_all_frames_may_take_and_no_more() -> None:
+    store = FrameStore(40, SHAPE, 10**15)  # more than any machine has
+    for seed in range(100):
+        store.append(store.encode(noise(seed)))
+    np.testing.assert_array_equal(store.decode(np.arange(60, 100)), [noise(seed) for seed in range(60, 100)])
+    assert (store.oldest_id, store.next_id) == (60, 100)
+
+
 def test_frames_of_noise_are_exact_and_forgotten_early_rather_than_outgrow_the_budget() -> None:
     budget = 100_000  # bytes
     store = FrameStore(1_000, (84, 84), budget)

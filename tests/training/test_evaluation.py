@@ -85,15 +85,17 @@ def test_the_actor_decides_for_one_half_while_the_other_is_emulated(
 
     env = tiny("env.max_steps=3").env
     with make_emulators(make_emulator(env), 5, workers=0) as emulators:
+        watch(emulators, "reset")
         watch(emulators, "send")
         watch(emulators, "receive")
         evaluate(Watched(4), emulators, episodes=6, epsilon=0.5, seed=5, size=env.size, stack=env.stack)
     next_of_three, next_of_two = ["receive", "decide 3", "send"], ["receive", "decide 2", "send"]
     the_sixth_episode = ["receive", "decide 1", "send"]  # on environment 0, while the others have none left
     assert tape == [
-        *("decide 3", "send", "decide 2", "send"),
+        *("reset", "decide 3", "send", "decide 2", "send"),  # all games are loaded at once
         *2 * (next_of_three + next_of_two),
-        *(the_sixth_episode + ["receive"] + 2 * the_sixth_episode + ["receive"]),
+        *("receive", "reset", "decide 1", "send", "receive"),
+        *(2 * the_sixth_episode + ["receive"]),
     ]
 
 

@@ -128,7 +128,10 @@ def test_the_same_seed_gives_the_same_training_and_another_seed_another(small: S
             marks=pytest.mark.slow,
         ),
         pytest.param(
-            ("env.num_envs=3", "env.workers=2", "sampler=prioritized", "phase.quick.sampler=prioritized"),
+            (
+                *("env.num_envs=3", "env.workers=2", "sampler=prioritized"),
+                *("phase.quick.sampler=prioritized", "phase.second.sampler=prioritized"),
+            ),
             marks=pytest.mark.slow,
         ),
         pytest.param(
@@ -152,9 +155,10 @@ def test_a_training_killed_in_every_phase_is_the_unbroken_one_bit_for_bit(
     config = tiny(*TWO_PHASES, *overrides)
     unbroken = started(config, tmp_path / "unbroken")
     unbroken.run()
-    for iterations in (0, 7, 38):  # of each session, committed at its end; then some more that are lost
+    for goal, phase in ((0, "quick"), (7, "quick"), (45, "quick"), (110, "second")):  # steps, committed; the next lost
         session = started(config, tmp_path / "broken")
-        assert session.run(after(iterations)) == "interrupted"
+        assert session.run(lambda: session.counters.steps >= goal) == "interrupted"  # noqa: B023
+        assert session.plan.phase_at(session.counters).name == phase
         session.commit = lambda: None  # type: ignore[method-assign]
         session.run(after(3))
     session = started(config, tmp_path / "broken")
@@ -349,6 +353,25 @@ def test_a_loss_that_is_no_number_stops_the_run_at_its_last_good_commit(small: S
     with pytest.raises(Diverged, match=f"update {trainer.learner.updates} is no finite number"):
         trainer.run()
     assert print_of(small(tmp_path, curve_steps=1_000), tmp_path) == good
+
+
+def test_a_network_that_has_diverged_is_not_evaluated(small: Small, tmp_path: Path) -> None:
+    trainer = small(tmp_path, curve_steps=1_000)
+    trainer.run(after(10))
+    next(trainer.learner.network.parameters()).data[:] = np.nan
+    with pytest.raises(Diverged):
+        trainer.run()
+    assert (trainer.counters.steps, trainer.recorder.evaluations) == (80, 0)
+
+
+def test_a_run_that_ends_where_it_was_evaluated_in_passing_is_evaluated_in_full(small: Small, tmp_path: Path) -> None:
+    trainer = small(tmp_path, interim_episodes=1)
+    assert trainer.run(lambda: trainer.recorder.evaluations == 1) == "interrupted"
+    ended = small(tmp_path, interim_episodes=1, max_steps=80)
+    assert ended.run() == "budget"
+    assert ended.recorder.last_metrics["evaluation/episodes"] == 2
+    assert small(tmp_path, interim_episodes=1, max_steps=80).run() == "budget"
+    assert curve(tmp_path, "evaluation/episodes") == [(80, 1), (80, 2)]
 
 
 @pytest.mark.parametrize("step", [80, 120])  # one amid the training, the one at its end
