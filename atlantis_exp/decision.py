@@ -197,7 +197,7 @@ def modes(values: npt.ArrayLike) -> Modes | None:
 
 
 def equal_scores(scores: Mapping[str, Sequence[float]]) -> list[list[str]]:
-    """The names whose lists of episode scores are equal, in sets of two or more: they are no two seeds.
+    """The names whose lists of episode scores are equal, in sets of two or more.
 
     Names are those of seeds or runs; the lists are in the order of the episodes.
     """

@@ -62,7 +62,8 @@ def margin(delta: str | float | None) -> tuple[float | None, bool]:
 
 def _list_out(arguments: list[str]) -> list[str]:
     """Let a list be written without brackets, as in `by=model,sampler`."""
-    # Hydra itself would take the commas for a sweep, and a second `=` for a mistake.
+    # Hydra itself would take the commas for a sweep, a second `=` for a mistake, and a commit's digits for a number.
+    arguments = [re.sub(r"^baseline=(\d\w*)$", r"baseline='\1'", argument) for argument in arguments]
     return [re.sub(r"^(by|runs|where)=([^\[].*)$", _listed, argument) for argument in arguments]
 
 

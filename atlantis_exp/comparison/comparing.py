@@ -145,19 +145,25 @@ def compare(
     players = [player for player in gathered.players if plays_alike(player, trainings[0])]
     _print_film((*trainings, *players))
     print(f"{how_to_open(outputs)}\n{folder.artifact(_PAGE)}")
-    if COMMIT in question.by and (worse := worse_than_baseline(comparison.answers)):
+    if COMMIT in question.by and (worse := worse_than_baseline(comparison.answers, question.by)):
         raise Fault(f"worse than the baseline {question.baseline}: {'; '.join(worse)}")
     return comparison
 
 
-def worse_than_baseline(answers: Sequence[Answer]) -> list[str]:
-    """The commits that were found worse than the baseline, by how much."""
+def worse_than_baseline(answers: Sequence[Answer], by: Sequence[str]) -> list[str]:
+    """What was found worse than the baseline and differs from it in its commit alone, by how much."""
+    place = list(by).index(COMMIT)
+
+    def others(answer: Answer, value: str) -> set[tuple[str, ...]]:
+        return {group.values[:place] + group.values[place + 1 :] for group in answer.family.groups[value]}
+
     return [
         f"{verdict.group} by {-verdict.difference:,.0f} points ({-verdict.high:,.0f} to {-verdict.low:,.0f}, "
         f"{verdict.seeds} seeds each)"
         for each in answers
         for verdict in each.decision.verdicts
         if each.family.plan.baseline is not None and COMMIT in each.family.name.split(",") and verdict.said == "worse"
+        if others(each, verdict.group) == others(each, verdict.other)
     ]
 
 

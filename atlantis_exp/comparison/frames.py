@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atlantis_exp.checking import flatten, to_dict
-from atlantis_exp.comparison.gather import Training, select
+from atlantis_exp.comparison.gather import Training, is_of_another, select
 from atlantis_exp.components import facts_of, game_of, known
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.episodes import EpisodeTable
@@ -158,7 +158,8 @@ def load_runs(
     for folder in _evaluations(outputs):
         try:
             facts = folder.config
-            if (run_of := by_name.get(facts.get("run", ""))) is not None:
+            run_of = by_name.get(facts.get("run", ""))
+            if run_of is not None and not is_of_another(folder, run_of.folder):
                 evaluation = facts["evaluation"]
                 of = (int(facts["step"]), "evaluate", evaluation["epsilon"], evaluation.get("seed"))
                 _add_evaluation(run_of, folder, EVALUATION, *of)

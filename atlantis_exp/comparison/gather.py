@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from atlantis_exp.checking import flatten, nearest, parse, to_dict
 from atlantis_exp.components import Component, facts_of, game_of, title_of
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.registry import Game
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.facts import read_tags
 from atlantis_exp.runs.folder import BEST_EPISODE, EVALUATION, RESULT, RunFolder, evaluation_at
@@ -156,7 +158,8 @@ def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None
 def _runs_of_decision(outputs: Path, name: str) -> list[str]:
     """The runs that a decision rests on, none where there is no decision of that name. Raises: Fault."""
     folders = [RunFolder(path) for path in (outputs / "decisions").glob("decide-*") if path.name == name]
-    return [str(run) for folder in folders for run in folder.config.get("runs", ())]
+    found = [folder.config.get("runs") for folder in folders]
+    return [run for runs in found if isinstance(runs, list) for run in runs if isinstance(run, str)]
 
 
 def select(trainings: Iterable[Training], where: Sequence[str]) -> list[Training]:
@@ -286,6 +289,12 @@ def _config(folder: RunFolder, put_aside: bool) -> dict[str, Any]:
     return tree
 
 
+def is_of_another(evaluation: RunFolder, run: RunFolder) -> bool:
+    """Whether an evaluation is older than a run: of one of the same name, which `resume=never` put aside."""
+    made, begun = evaluation.commit, run.commit
+    return made is not None and begun is not None and made.updated < begun.started
+
+
 def _training(
     folder: RunFolder,
     config: Config,
@@ -303,7 +312,9 @@ def _training(
     steps = result.steps
     tables = [(config.evaluation.epsilon, folder, folder.artifact(evaluation_at(steps)))]
     tables += [
-        (later.epsilon, later.folder, later.folder.artifact(EVALUATION)) for later in evaluations if later.step == steps
+        (later.epsilon, later.folder, later.folder.artifact(EVALUATION))
+        for later in evaluations
+        if later.step == steps and not is_of_another(later.folder, folder)
     ]
     tables = [table for table in tables if table[2].exists() and epsilon in (None, table[0])]
     if not tables:
@@ -315,7 +326,7 @@ def _training(
     science["phase"] = {str(index): phase for index, phase in enumerate(science["phase"])}
     budget = config.budget.steps if result.outcome == "budget" else None
     leaves = flatten(to_dict(config)) | {"evaluation.epsilon": taken, "budget.steps": budget}
-    episodes = _episodes(path, facts_of(config.env.game).sources)
+    episodes = _episodes(path, facts_of(config.env.game))
     is_filmed = player != folder or tags.get("best_evaluation", "").endswith(f" at step {steps}")
     film = player.artifact(BEST_EPISODE) if is_filmed else None
     return Training(folder.name, leaves, flatten(science), arrays, episodes, tags, policy, film)
@@ -336,20 +347,27 @@ def _evaluations(outputs: Path, skipped: dict[str, str]) -> tuple[dict[str, list
             facts, commit = folder.config, folder.commit
             if commit is None:
                 continue
-            epsilon = float(facts["evaluation"]["epsilon"])
+            if not isfinite(epsilon := float(facts["evaluation"]["epsilon"])):
+                raise ValueError("its epsilon is no number")
             if "run" in facts:
                 found[str(facts["run"])].append(_Later(commit.updated, int(facts["step"]), epsilon, folder))
             elif "weights" in facts:
                 player = _player(folder, facts)
                 exported[str(facts["sha256"]), epsilon].append((commit.updated, folder.name, player))
-        except (Fault, ValueError, KeyError, TypeError, OSError) as error:
+        except (Fault, ValueError, KeyError, TypeError, OverflowError, OSError) as error:
             skipped[f"evaluations/{folder.name}"] = f"broken: {type(error).__name__}: {error}"
     trainings = {run: sorted(later, key=lambda each: each.made) for run, later in found.items()}
     return trainings, [max(made)[-1] for made in exported.values()]
 
 
-def _episodes(path: Path, sources: Sequence[str] = ()) -> EpisodeTable:
-    episodes = EpisodeTable.read(path, sources)
+def _episodes(path: Path, game: Game | None = None) -> EpisodeTable:
+    """A table of episodes, and of its points those of a game's sources. Raises: ValueError, OSError."""
+    episodes = EpisodeTable.read(path, game.sources if game else ())
     if not np.isfinite(episodes.scores).all():
         raise ValueError(f"{path} has a score that is no finite number")
+    others = (episodes.steps, episodes.frames, episodes.truncated, episodes.counts)
+    if not all(np.isfinite(each).all() for each in others):
+        raise ValueError(f"{path} has a count that is no finite number")
+    if game and game.actions and episodes.actions != game.actions:
+        raise ValueError(f"{path} has other actions than the game")
     return episodes

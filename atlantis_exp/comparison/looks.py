@@ -70,7 +70,12 @@ def _check(family: Family, looks: Sequence[Look]) -> None:
         sizes |= {verdict.seeds for verdict in look.verdicts}
         if len(sizes) != 1 or not size < look.size <= family.plan.looks[-1] or not np.isfinite(numbers).all():
             raise ValueError(f"its looks by {family.name} are at impossible numbers")
-        if not look.error > 0 or spent > family.plan.error * (1 + 1e-9):
-            raise ValueError(f"its looks by {family.name} spent what there is not")
+        if not np.isclose(spent, family.plan.spendable(look.size), rtol=1e-6):
+            raise ValueError(f"its looks by {family.name} spent what none does")
+        for verdict in look.verdicts:
+            found = {"better": verdict.low > 0, "worse": verdict.high < 0, "equivalent": family.plan.delta is not None}
+            is_so = found.get(verdict.said, verdict.low <= 0 <= verdict.high)
+            if not (is_so and verdict.low <= verdict.difference <= verdict.high):
+                raise ValueError(f"its looks by {family.name} say what their intervals do not")
         size = look.size
         open_pairs = {(verdict.group, verdict.other) for verdict in look.verdicts if verdict.said == "not decided"}

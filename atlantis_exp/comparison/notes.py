@@ -4,11 +4,13 @@ import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from math import isclose, nan
+from statistics import fmean
 from typing import TypeVar
 
 from atlantis_exp.comparison.gather import AXES, COMMIT, Training, resolve
 from atlantis_exp.comparison.published import Table, early_dqn, random_line
-from atlantis_exp.comparison.verdict import Answer, counted
+from atlantis_exp.comparison.verdict import Answer
 from atlantis_exp.components import Component, facts_of
 from atlantis_exp.decision import FEWEST_SEEDS, equal_scores
 from atlantis_exp.runs.folder import LOST
@@ -46,23 +48,15 @@ def collapsed(facts: Facts) -> Iterator[str]:
             )
 
 
-def equal_within(facts: Facts) -> Iterator[str]:
-    """Runs that do not count as seeds."""
-    for runs in facts.groups.values():
-        for name, first in counted(runs)[1].items():
-            yield f"{name} has the same score in every episode as {first.name}: the two count as one seed."
-
-
-def equal_across(facts: Facts) -> Iterator[str]:
-    """Equal lists of scores in different groups, which count."""
-    group_of = {run.name: label for label, runs in facts.groups.items() for run in counted(runs)[0]}
-    scores = {run.name: run.episodes.scores.tolist() for run in facts.trainings if run.name in group_of}
+def equal(facts: Facts) -> Iterator[str]:
+    """Equal lists of scores, which count like others."""
+    label_of = {run.name: label for label, runs in facts.groups.items() for run in runs}
     alike = defaultdict(list)
-    for names in equal_scores(scores):
-        if len(labels := dict.fromkeys(group_of[name] for name in names)) > 1:
-            alike[" and ".join(labels)].extend(names)
-    for labels_of, names in alike.items():
-        yield f"{labels_of} have runs with the same score in every episode: {_listed(names)}."
+    for names in equal_scores({run.name: run.episodes.scores.tolist() for run in facts.trainings}):
+        alike[tuple(dict.fromkeys(label_of[name] for name in names))].extend(names)
+    for labels, names in alike.items():
+        has = "has" if len(labels) == 1 else "have"
+        yield f"{' and '.join(labels)} {has} runs with the same score in every episode: {_listed(names)}."
 
 
 def modes_found(facts: Facts) -> Iterator[str]:
@@ -149,6 +143,26 @@ def later_seeds(facts: Facts) -> Iterator[str]:
         )
 
 
+def moved_seeds(facts: Facts) -> Iterator[str]:
+    """Seeds of a look that are gone, or have other scores now."""
+    for answer in facts.answers:
+        stands: dict[str, bool] = {}
+        for look in answer.decision.looks:
+            means = {
+                value: fmean(answer.family.seeds[value].get(seed, nan) for seed in seeds)
+                for value, seeds in look.seeds.items()
+            }
+            for verdict in look.verdicts:
+                now = means[verdict.group] - means[verdict.other]
+                pair = f"{verdict.group} against {verdict.other}"
+                stands[pair] = isclose(now, verdict.difference, abs_tol=1e-6)
+        if moved := [pair for pair, is_so in stands.items() if not is_so]:
+            yield (
+                f"By {answer.family.name}, runs of past looks are gone or have other scores now, and what was said "
+                f"stays: {_listed(moved)}."
+            )
+
+
 def unplanned(facts: Facts) -> Iterator[str]:
     """Looks between the planned ones."""
     for answer in facts.answers:
@@ -163,7 +177,7 @@ def unplanned(facts: Facts) -> Iterator[str]:
 def few_seeds(facts: Facts) -> Iterator[str]:
     """Groups that can decide nothing."""
     for label, runs in facts.groups.items():
-        seeds = len({run.config["seed"] for run in counted(runs)[0]})
+        seeds = len({run.config["seed"] for run in runs})
         if seeds < FEWEST_SEEDS:
             yield f"{label} has {seeds} of the {FEWEST_SEEDS} seeds without which nothing is decided."
 
@@ -254,8 +268,7 @@ def other_players(facts: Facts) -> Iterator[str]:
 
 CAVEATS: Sequence[Callable[[Facts], Iterator[str]]] = (
     collapsed,
-    equal_within,
-    equal_across,
+    equal,
     modes_found,
     different_makers,
     different_lengths,
@@ -264,6 +277,7 @@ CAVEATS: Sequence[Callable[[Facts], Iterator[str]]] = (
     uncommitted,
     unbalanced,
     later_seeds,
+    moved_seeds,
     unplanned,
 )
 """What can make a verdict mean something else."""

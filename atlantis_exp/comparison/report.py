@@ -93,7 +93,7 @@ COLUMNS = {
         "score": "score",
         **_EPISODES,
         "policy": "policy",
-        "same_as": "counts as one with",
+        "same_as": "plays as",
     },
     "actions": {"group": "group", "action": "action", "network": "network", "random": "chance"},
     "probes": {
@@ -152,7 +152,7 @@ EXPLAINED = {
     "FLOPs": "floating-point operations of all gradient updates",
     "epsilon": "the share of actions left to chance in evaluation",
     "policy": "the action that the network chose most in evaluation; collapsed: it chose one only",
-    "counts as one with": "a run with the same score in every episode",
+    "plays as": "a run with the same score in every episode",
     "chance": "the share of steps whose action was drawn at random",
     "by chance": "the share of equal actions if both chose independently, each as often as it does",
     "distance of advantages": "the mean difference of normalised action values: 0 if equal, about 1.1 if unrelated",

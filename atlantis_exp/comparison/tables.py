@@ -13,10 +13,10 @@ import numpy as np
 from atlantis_exp.comparison.gather import AXES, Array, Gathered, Player, Training, plays_alike
 from atlantis_exp.comparison.notes import CAVEATS, NOTES, Facts
 from atlantis_exp.comparison.published import Row, Table, curves, scores
-from atlantis_exp.comparison.verdict import Answer, Question, answer, counted, families, group_of
+from atlantis_exp.comparison.verdict import Answer, Question, answer, families, group_of
 from atlantis_exp.comparison.words import said
 from atlantis_exp.components import facts_of, title_of
-from atlantis_exp.decision import FEWEST_SEEDS, Look, Plan, Verdict, decide, mean_interval, modes
+from atlantis_exp.decision import FEWEST_SEEDS, Look, Plan, Verdict, decide, equal_scores, mean_interval, modes
 from atlantis_exp.registry import Game
 from atlantis_exp.statistics import Scores, human_normalised, probability_of_improvement, summarize
 
@@ -68,8 +68,7 @@ def compare(
     named: list[tuple[str, dict[str, dict[int, float]], Answer | None]] = [
         (each.family.name, each.family.seeds, each) for each in answers
     ] or [("all", by_label, None)]
-    once = {label: counted(runs)[0] for label, runs in groups.items()}  # those that play equal games count as one
-    evaluation = [_evaluation(label, runs, game) for label, runs in once.items()]
+    evaluation = [_evaluation(label, runs, game) for label, runs in groups.items()]
     tables: dict[str, Table] = {
         "scores": [row for family in named for row in _scores(*family)],
         "seeds": [
@@ -82,18 +81,18 @@ def compare(
         "plan": [_plan(each) for each in answers],
         "looks": [row for each in answers for row in _looks(each)],
         "evaluation": evaluation,
-        "why": [_why(label, runs, game.sources) for label, runs in once.items()],
+        "why": [_why(label, runs, game.sources) for label, runs in groups.items()],
         "modes": [row for row in evaluation for row in _modes(row, by_label[row["group"]])],
-        "improvement": _improvement(once),
+        "improvement": _improvement(groups),
         "views": _views(groups),
         "runs": [row for label, runs in groups.items() for row in _runs(label, runs)],
         "curves": [row for axis in AXES for label, runs in groups.items() for row in _curve(axis, label, runs)],
         "seed_curves": [
             row for axis in AXES for label, runs in groups.items() for row in _seed_curves(axis, label, runs)
         ],
-        "profile": _profile(once, game),
-        "actions": [row for label, runs in once.items() for row in _actions(label, runs)],
-        "episodes": [row for label, runs in once.items() for training in runs for row in _episodes(label, training)],
+        "profile": _profile(groups, game),
+        "actions": [row for label, runs in groups.items() for row in _actions(label, runs)],
+        "episodes": [row for label, runs in groups.items() for training in runs for row in _episodes(label, training)],
         "references": [_measured(player) for player in players] + scores(component),
         "published_curves": [row for row in curves(component) if row["frames"] <= frames],
         "skipped": [{"run": name, "reason": reason} for name, reason in gathered.skipped.items()],
@@ -262,7 +261,8 @@ def _modes(evaluation: Row, seeds: Mapping[int, float]) -> Table:
 
 
 def _runs(label: str, runs: Sequence[Training]) -> Table:
-    same = counted(runs)[1]
+    alike = equal_scores({run.name: run.episodes.scores.tolist() for run in runs})
+    same = {name: first for first, *others in alike for name in others}
     table = []
     for training in runs:
         summary = summarize(training.episodes.scores)
@@ -281,7 +281,7 @@ def _runs(label: str, runs: Sequence[Training]) -> Table:
                 "low": summary.low,
                 "high": summary.high,
                 "policy": training.policy,
-                "same_as": same[training.name].name if training.name in same else "",
+                "same_as": same.get(training.name, ""),
             }
         )
     return table

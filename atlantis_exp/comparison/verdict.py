@@ -7,14 +7,14 @@ the looks that are due, and `wanted` says which seeds the next looks need.
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import count, islice
 
 import numpy as np
 
 from atlantis_exp.checking import nearest
 from atlantis_exp.comparison.gather import COMMIT, Training, values_of
-from atlantis_exp.decision import Decision, Look, Plan, decide, equal_scores, looks_up_to
+from atlantis_exp.decision import Decision, Look, Plan, decide, looks_up_to
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.statistics import interquartile_mean
 
@@ -39,7 +39,6 @@ class Group:
 
     values: tuple[str, ...]
     seeds: dict[int, float]
-    same: dict[int, int] = field(default_factory=dict)  # seeds that do not count: to the one whose episodes they equal
 
     @property
     def label(self) -> str:
@@ -72,35 +71,16 @@ def scored(training: Training) -> float:
     return interquartile_mean(training.episodes.scores)
 
 
-def counted(runs: Sequence[Training]) -> tuple[list[Training], dict[str, Training]]:
-    """The runs that count as seeds of one group, and those that do not: their names to the run they are the same as.
-
-    Runs of equal lists of episode scores are one, that of the lowest seed.
-    """
-    runs = sorted(runs, key=lambda run: (run.config["seed"], run.name))
-    by_name = {run.name: run for run in runs}
-    same = {
-        name: by_name[first]
-        for first, *others in equal_scores({run.name: run.episodes.scores.tolist() for run in runs})
-        for name in others
-    }
-    return [run for run in runs if run.name not in same], same
-
-
 def group_of(runs: Sequence[Training], by: Sequence[str]) -> Group:
-    """One score a seed of the runs of a group; runs of the same seed, which only a mixed group has, are averaged."""
-    kept, same = counted(runs)
+    """One score a seed of the runs of a group; runs of the same seed, which only a mixed group has, are averaged.
+
+    Seeds that play equal games, as those that collapsed alike do, count like any other: to train others in their place
+    would choose among the seeds by their scores.
+    """
     scores = defaultdict(list)
-    for run in kept:
+    for run in runs:
         scores[int(run.config["seed"])].append(scored(run))
-    dropped = {
-        int(run.config["seed"]): int(same[run.name].config["seed"])
-        for run in runs
-        if run.name in same and run.config["seed"] not in scores
-    }
-    return Group(
-        values_of(runs[0], by), {seed: float(np.mean(found)) for seed, found in sorted(scores.items())}, dropped
-    )
+    return Group(values_of(runs[0], by), {seed: float(np.mean(found)) for seed, found in sorted(scores.items())})
 
 
 def families(groups: Sequence[Group], question: Question) -> list[Family]:
@@ -209,9 +189,9 @@ def wanted(answers: Sequence[Answer]) -> dict[str, list[int]]:
     for family, decision in ((each.family, each.decision) for each in answers):
         for value in decision.contenders if decision.next_look is not None else ():
             members = family.groups[value]
-            unusable = {seed for group in members for seed in group.same} | family.seeds[value].keys()
-            missing = max(0, (decision.next_look or 0) - len(family.seeds[value]))
-            for seed in islice((seed for seed in count() if seed not in unusable), missing):
+            there = family.seeds[value].keys()
+            missing = max(0, (decision.next_look or 0) - len(there))
+            for seed in islice((seed for seed in count() if seed not in there), missing):
                 for group in members:
                     lacking[group.label] |= {seed} - group.seeds.keys()
     return {label: sorted(seeds) for label, seeds in sorted(lacking.items()) if seeds}

@@ -4,6 +4,7 @@ The runs are ordinary ones, and the looks are those of `compare` over them, whos
 moment, the same command goes on where it was.
 """
 
+import re
 import subprocess
 import sys
 import tempfile
@@ -29,7 +30,7 @@ from atlantis_exp.decision import detectable, equivalence, looks_up_to
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import Journal, Metrics, NullJournal, read
+from atlantis_exp.runs.journal import Journal, Metrics, NullJournal
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.job import Job, command_line, labels, quoted
 from atlantis_exp.sessions.sweep import ledger, terminable
@@ -37,8 +38,6 @@ from atlantis_exp.sessions.training import expected, train
 from atlantis_exp.tracking.publishing import catch_up, publishing
 from atlantis_exp.training.forecast import duration
 from atlantis_exp.training.progress import Progress
-
-_SPARE = 2  # times the plan's seeds that may be trained, since equal games count once
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ def decide(request: Request) -> None:
     Raises:
         ConfigError: where two contenders are the same training, their scores would not mean the same, a run was trained
             for longer, or the baseline is none of them.
-        Fault: where a training fails, or a contender's seeds cannot be told apart; the same command goes on.
+        Fault: where a training fails; the same command goes on.
     """
     session = _Session.of(request)
     outputs = session.outputs
@@ -161,7 +160,7 @@ class _Session:
     @property
     def runs(self) -> list[RunFolder]:
         """The runs that may belong to the answer."""
-        seeds = range(_SPARE * self.request.question.seeds)
+        seeds = range(self.looks[-1])
         return [RunFolder.of(self.job(label, seed).config) for label in self.contenders for seed in seeds]
 
     @property
@@ -245,9 +244,6 @@ class _Session:
             if unusable := [seed for seed in seeds if self.done(label, seed)]:
                 name = self.job(label, unusable[0]).config.run_name()
                 raise Fault(f"run {name} has ended and cannot be compared; above it says why")
-            most = _SPARE * self.request.question.seeds
-            if max(seeds) >= most:
-                raise Fault(f"{label}: {most} seeds are not enough, for many play equal games; train it for longer")
         return needed
 
     def train(self, needed: Mapping[str, Sequence[int]]) -> None:
@@ -296,8 +292,7 @@ class _Session:
         fewest = f"{count * looks[0]} to " if len(looks) > 1 else ""
         say(
             f"{', '.join(self.contenders)}: {fewest}{count * looks[-1]} runs, looks at "
-            f"{' and '.join(map(str, looks))} seeds each; {count * looks[-1] - sum(missing.values())} are there. "
-            f"Seeds that play equal games count as one, and others take their place."
+            f"{' and '.join(map(str, looks))} seeds each; {count * looks[-1] - sum(missing.values())} are there."
         )
         hours = 0.0
         for label, runs in missing.items():
@@ -334,25 +329,26 @@ class _Session:
         shares = []
         for label in self.contenders:
             ended = [RunFolder.of(self.job(label, seed).config).result for seed in range(self.looks[-1])]
-            scores = {
+            scores = [
                 result.evaluation["evaluation/interquartile_mean"] for result in ended if result and result.evaluation
-            }
-            if len(scores) > 2 and np.mean(list(scores)) > 0:
-                shares.append(float(np.std(list(scores), ddof=1) / np.mean(list(scores))))
+            ]
+            if len(set(scores)) > 2 and np.mean(scores) > 0:
+                shares.append(float(np.std(scores, ddof=1) / np.mean(scores)))
         if shares:
             return float(np.mean(shares)), "those that are there do"
-        rows = [row for row in curves(self._first.config.game) if row["mean"] > 0]
-        if not rows:
-            return None
         # Of five seeds the range is 2.326 standard deviations on average.
-        published = [(row["high"] - row["low"]) / 2.326 / row["mean"] for row in rows]
-        return float(np.median(published)), "published ones do (Dopamine's DQN, five seeds)"
+        published = [
+            (row["high"] - row["low"]) / 2.326 / row["mean"]
+            for row in curves(self._first.config.game)
+            if row["source"].startswith("google/dopamine") and row["mean"] > 0
+        ]
+        return (float(np.median(published)), "published ones do (Dopamine's agents, five seeds)") if published else None
 
     def write(self, journal: Journal, comparison: Comparison) -> None:
         """Write the looks that the page does not have yet, what they spent, and what is known now."""
         there = {
             (record.step, key)
-            for _, record in read(self.folder.path)
+            for record in self.folder.records()
             if isinstance(record, Metrics)
             for key in record.values
         }
@@ -389,5 +385,7 @@ def _looks(comparison: Comparison) -> str:
 
 
 def _metric(name: str) -> str:
-    """A name in MLflow's alphabet."""
-    return "".join(character if character.isalnum() or character in "_.- /" else "_" for character in name)
+    """A name in MLflow's alphabet: what is measured, of what, of which pair."""
+    parts = (re.sub(r"[^A-Za-z0-9_. -]|^\W", "_", part) for part in name.split("/", 2))
+    whole = "/".join(parts)
+    return whole if len(whole) <= 250 else f"{whole[:240]} {digest({'name': name})[:8]}"

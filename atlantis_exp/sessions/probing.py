@@ -15,7 +15,7 @@ from atlantis_exp.build import make_emulator
 from atlantis_exp.comparison.comparing import Probed, slug
 from atlantis_exp.comparison.gather import Training
 from atlantis_exp.comparison.published import Row, Table
-from atlantis_exp.comparison.verdict import counted, scored
+from atlantis_exp.comparison.verdict import scored
 from atlantis_exp.components import facts_of
 from atlantis_exp.config import EnvConfig
 from atlantis_exp.faults import Fault
@@ -109,8 +109,8 @@ def _probe_groups(outputs: Path, groups: Mapping[str, Sequence[Training]], basel
 
 
 def median_run(runs: Sequence[Training]) -> Training:
-    """The run of the median score among those that count as seeds; of two, the lower."""
-    ordered = sorted(counted(runs)[0], key=lambda run: (scored(run), run.config["seed"], run.name))
+    """The run of the median score; of two, the lower."""
+    ordered = sorted(runs, key=lambda run: (scored(run), run.config["seed"], run.name))
     return ordered[(len(ordered) - 1) // 2]
 
 

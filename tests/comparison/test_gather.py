@@ -3,15 +3,16 @@
 import json
 import re
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from atlantis_exp.comparison.gather import gather, group, refuse_mixed_protocols, select
+from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
-from atlantis_exp.registry import Game
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.training.evaluation import Episode, Evaluation
@@ -25,10 +26,10 @@ def evaluated(outputs: Path, run: Path, score: float, epsilon: float, step: int 
     journal = Journal(folder)
     facts = {"run": run.name, "step": step, "evaluation": {"epsilon": epsilon}}
     (folder / "config.json").write_text(json.dumps(facts))
-    episode = Episode(0, score, 9, False, bytearray([1, 1, 1]), bytearray([0, 0, 1]))
+    episode = Episode(0, score, 9, False, bytearray([1, 1, 1]), bytearray([0, 0, 1]), points=[0.0] * 5)
     journal.artifact(
         "evaluation/episodes.csv",
-        Evaluation(epsilon, [episode], Game(actions=("NOOP", "FIRE"))).table().to_csv().encode(),
+        Evaluation(epsilon, [episode], facts_of(game_of("Atlantis-v0"))).table().to_csv().encode(),
     )
     journal.finish()
     (folder / "result.json").write_text("{}")
@@ -92,6 +93,57 @@ def test_broken_unfinished_foreign_and_put_aside_runs_are_named_and_do_not_count
     assert len(gathered.skipped) == len(damage)
     for index, reason in enumerate(damage):
         assert re.search(reason, gathered.skipped[f"run-{index}"])
+
+
+@pytest.mark.parametrize(("column", "value"), [("steps", "nan"), ("truncated", "inf"), ("NOOP", "inf")])
+def test_a_table_with_counts_that_are_no_numbers_is_named(
+    recorded: Recorded, tmp_path: Path, column: str, value: str
+) -> None:
+    run = recorded()
+    table = next(run.rglob("*.csv"))
+    header, first, *others = table.read_text().splitlines()
+    cells = dict(zip(header.split(","), first.split(","), strict=True)) | {column: value}
+    table.write_text("\n".join([header, ",".join(cells.values()), *others]))
+    assert "has a count that is no finite number" in gather(tmp_path).skipped[run.name]
+
+
+def test_a_table_of_other_actions_is_named(recorded: Recorded, tmp_path: Path) -> None:
+    run = recorded()
+    table = next(run.rglob("*.csv"))
+    table.write_text(table.read_text().replace("RIGHTFIRE", "UPFIRE"))
+    assert "has other actions than the game" in gather(tmp_path).skipped[run.name]
+
+
+@pytest.mark.parametrize(
+    "facts", ['{"step": 1e400, "run": "x", "evaluation": {"epsilon": 0.1}}', '{"run": "x"}', "null"]
+)
+def test_a_damaged_evaluation_is_named_and_harms_no_run(recorded: Recorded, tmp_path: Path, facts: str) -> None:
+    run = recorded()
+    (evaluated(tmp_path, run, 2.0, 0.1) / "config.json").write_text(facts)
+    gathered = gather(tmp_path)
+    assert len(gathered.trainings) == 1
+    assert "broken: " in " ".join(gathered.skipped.values()) or facts == "null"
+
+
+def test_an_evaluation_of_a_run_that_was_put_aside_is_not_the_new_ones(recorded: Recorded, tmp_path: Path) -> None:
+    old = recorded(scores=(9_000.0,))
+    evaluated(tmp_path, old, 9_151.0, 0.05)
+    old.rename(old.with_name(f"{old.name}~1"))
+    time.sleep(0.01)
+    new = recorded(scores=(1_000.0,))
+    assert new == old
+    assert gather(tmp_path).trainings[0].episodes.scores.tolist() == [1_000]
+    evaluated(tmp_path, new, 1_150.0, 0.05)
+    assert gather(tmp_path).trainings[0].episodes.scores.tolist() == [1_150]
+
+
+@pytest.mark.parametrize("runs", ["5", "null", "[1, {}]"])
+def test_a_decision_whose_runs_are_no_names_has_none(recorded: Recorded, tmp_path: Path, runs: str) -> None:
+    recorded()
+    folder = tmp_path / "decisions" / "decide-x"
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text(f'{{"runs": {runs}}}')
+    assert gather(tmp_path, ["decide-x"]).trainings == []
 
 
 def test_the_latest_evaluation_after_the_last_step_counts_and_epsilon_chooses_among_them(

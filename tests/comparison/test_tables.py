@@ -196,16 +196,16 @@ def test_a_curve_is_the_mean_over_runs_as_far_as_all_of_them_go(recorded: Record
     assert {row["epsilon"] for row in rows} == {0.5}
 
 
-def test_runs_of_one_seed_and_of_equal_games_are_one_seed_in_every_table(recorded: Recorded, tmp_path: Path) -> None:
+def test_runs_of_one_seed_are_one_seed_and_those_of_equal_games_are_not(recorded: Recorded, tmp_path: Path) -> None:
     for seed, sampler, last in ((0, "uniform", 0), (0, "top_half", 200), (1, "uniform", 400), (2, "uniform", 999)):
         scores = (1.0, 3.0 + min(seed, 1))  # seed 2 plays as seed 1
         recorded(f"seed={seed}", f"sampler={sampler}", scores=scores, curve=((0, 0, 0, 0), (100, 1, 1, last)))
     gathered = gather(tmp_path)
     tables = compare(gathered, group(gathered.trainings, ["model"]), Question(["model"])).tables
-    assert tables["scores"][0]["seeds"] == 2
+    assert tables["scores"][0]["seeds"] == 3
     curve = [row["score"] for row in tables["curves"] if row["axis"] == "frames"]
     assert curve[-1] == (100 + 400 + 999) / 3  # of trainings, which may differ though their last games do not
-    assert len({row["run"] for row in tables["episodes"]}) == 2
+    assert len({row["run"] for row in tables["episodes"]}) == 4
     assert tables["evaluation"][0]["episodes"] == len(tables["episodes"])
     assert len(tables["runs"]) == 4
 
