@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.special import stdtrit
 from scipy.stats import norm
 
-from atlantis_exp.decision import Decision, Look, Plan, decide, mean_interval
+from atlantis_exp.decision import Decision, Look, Plan, decide, looks_up_to, mean_interval
 from benchmarks.contest import print_results, print_table
 
 Values = npt.NDArray[np.float64]
@@ -258,7 +258,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         ],
     )
 
-    plans = {"5 and 10": plan, "10": single, "10 and 20": Plan(looks=(10, 20))}
+    plans = {
+        "5 and 10": plan,
+        "10": single,
+        "5, 10 and 20": Plan(looks=looks_up_to(20)),
+        "10 and 20": Plan(looks=(10, 20)),
+    }
     mixtures = {
         "bimodal 70:30 and steady": (bimodal, steady),
         "three bimodal 70:30 and steady": (bimodal, bimodal, bimodal, steady),
