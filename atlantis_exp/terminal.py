@@ -24,6 +24,11 @@ def console(least: int | None = None) -> Console:
     return Console(highlight=False, markup=False, emoji=False, width=width)
 
 
+def harmless(text: str) -> str:
+    """A stored text without what a terminal would obey: its lines of printable characters."""
+    return "".join(character for character in text if character == "\n" or character.isprintable())
+
+
 @contextmanager
 def working(what: str, how_far: Callable[[], str] = str) -> Iterator[None]:
     """Say what is under way, and how far: in a changing line on a terminal, elsewhere in a line every few seconds.

@@ -13,6 +13,10 @@ from rich.console import Console
 from atlantis_exp import terminal
 
 
+def test_a_stored_text_keeps_its_lines_and_loses_what_a_terminal_obeys() -> None:
+    assert terminal.harmless("a\x1b]52;c;cm0=\x07\r\x9b2J\u202eb\nmean ± é") == "a]52;c;cm0=2Jb\nmean ± é"
+
+
 @pytest.fixture
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(terminal, "_FIRST_SECONDS", 0.01)

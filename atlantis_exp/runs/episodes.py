@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from atlantis_exp.runs.files import ARTIFACT, read_file
+from atlantis_exp.runs.files import SMALL, read_file
 
 Array = npt.NDArray[np.float64]
 
@@ -46,7 +46,7 @@ class EpisodeTable:
     def read(cls, path: Path, sources: Sequence[str] = ()) -> Self:
         """The table in a file, and of its points those of these sources. Raises: ValueError, OSError."""
         try:
-            header, *lines = csv.reader(io.StringIO(read_file(path, ARTIFACT).decode(), newline=""), strict=True)
+            header, *lines = csv.reader(io.StringIO(read_file(path, SMALL).decode(), newline=""), strict=True)
             rows = [dict(zip(header, line, strict=True)) for line in lines]
             return cls._of(rows, sources)
         except (ValueError, KeyError, csv.Error) as error:

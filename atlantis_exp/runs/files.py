@@ -15,8 +15,8 @@ from pydantic_core import from_json
 
 T = TypeVar("T")
 
-SMALL = 2**24  # bytes; what a run says of itself has some kilobytes
-ARTIFACT = 2**30  # bytes, of a table, a film or a network
+SMALL = 2**24  # bytes; what a run says of itself has some kilobytes, a table of 20,000 episodes two megabytes
+ARTIFACT = 2**30  # bytes, of a film or a network
 CHECKPOINT = 2**36  # bytes, of a whole replay memory
 
 _schemas: dict[Any, TypeAdapter[Any]] = {}

@@ -12,6 +12,7 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import SMALL, no_link, open_file, read_file
 
 _HOLDER = "holder.txt"  # not the lock itself, which is emptied by whoever asks for it
+_OF_OPTUNA = "trials.jsonl.lock"  # a link while a process writes
 
 
 @contextmanager
@@ -42,9 +43,10 @@ def _holder(folder: Path) -> str:
 
 
 def _link(folder: Path) -> Path | None:
-    """A folder itself or what is in it, if that is a symbolic link; Optuna's locks are."""
+    """A folder itself or what is in it, if that is a symbolic link other than Optuna's lock of a search."""
     places = (Path(above, name) for above, folders, files in os.walk(folder) for name in (*folders, *files))
-    return next((path for path in (folder, *places) if path.suffix != ".lock" and path.is_symlink()), None)
+    links = (path for path in (folder, *places) if path.is_symlink())
+    return next((link for link in links if link != folder / _OF_OPTUNA), None)
 
 
 def is_held(folder: Path) -> bool:

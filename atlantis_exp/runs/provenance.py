@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
@@ -16,10 +17,12 @@ def provenance(command: str) -> dict[str, str]:
     if (checkout / ".git").exists():
 
         def git(*arguments: str) -> str:
-            done = subprocess.run(("git", *arguments), cwd=checkout, capture_output=True, text=True, check=False)
+            done = subprocess.run(("git", *arguments), cwd=checkout, capture_output=True, text=True, check=True)
             return done.stdout.strip()
 
-        tags["git.commit"] = git("rev-parse", "HEAD")
-        tags["git.dirty"] = str(bool(git("status", "--porcelain", "--untracked-files=no"))).lower()
+        with suppress(OSError, subprocess.CalledProcessError):  # there is no git, or it refuses somebody else's folder
+            commit = git("rev-parse", "HEAD")
+            dirty = str(bool(git("status", "--porcelain", "--untracked-files=no"))).lower()
+            tags |= {"git.commit": commit, "git.dirty": dirty}
     tags["command"] = command
     return tags

@@ -61,7 +61,8 @@ def decide(request: Request) -> None:
             for longer, or the baseline is none of them.
         Fault: where a training fails; the same command goes on.
     """
-    session = _Session.of(request)
+    with terminal.working("composing the runs"):
+        session = _Session.of(request)
     outputs = session.outputs
     catch_up(outputs, session.tracking.uri)
     shown = labels(f"decide {' '.join(request.several)}", run_colour("decide"), "decision")

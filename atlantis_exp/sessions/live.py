@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 from rich.console import Console
@@ -9,6 +10,7 @@ from rich.live import Live
 from rich.table import Table
 
 from atlantis_exp import terminal
+from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder, State
 from atlantis_exp.runs.journal import Metrics, read, read_commit
 from atlantis_exp.sessions.job import Job
@@ -87,7 +89,8 @@ class LiveTable:
     def look(self) -> None:
         """Read what is new, and show it."""
         for run in self._runs:
-            run.look()
+            with suppress(OSError, ValueError, Fault):  # of a damaged journal, which the run's own command names
+                run.look()
         if self._console.is_terminal:
             self._draw()
         else:

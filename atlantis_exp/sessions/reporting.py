@@ -38,7 +38,7 @@ def report(*, paths: PathsConfig) -> None:
     console.print(table)
     for run, result in zip(runs, results, strict=True):
         if result is not None:
-            console.print(f"\n{run.name}\n{result.report}")
+            console.print(terminal.harmless(f"\n{run.name}\n{result.report}"))
     console.print(how_to_open(outputs), end="")
 
 

@@ -12,6 +12,7 @@ from typing import Any, NoReturn, get_args
 
 import numpy as np
 
+from atlantis_exp import terminal
 from atlantis_exp.checking import digest
 from atlantis_exp.faults import Fault
 from atlantis_exp.media import curves, strips
@@ -71,7 +72,7 @@ def _reason(folder: RunFolder) -> str:
     if not folder.error:
         return ""
     path = folder.path / TRACEBACK
-    return f": {folder.error}" + (f" ({path})" if folder.state == "failed" and path.exists() else "")
+    return f": {terminal.harmless(folder.error)}" + (f" ({path})" if folder.state == "failed" and path.exists() else "")
 
 
 @contextmanager
@@ -169,7 +170,7 @@ def _every(seconds: float, look: Callable[[], None]) -> Iterator[Callable[[], No
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """SIGTERM between two runs ends the process as an exception does; a run listens for itself."""
+    """SIGTERM ends the process as an exception does; a run that is trained in the block listens for itself."""
 
     def end(number: int, _: FrameType | None) -> NoReturn:
         sys.exit(128 + number)
@@ -204,7 +205,8 @@ def _describe(journal: Journal, jobs: Sequence[Job], folders: Sequence[RunFolder
             scores = [
                 f"{result.evaluation[f'evaluation/{point}']:,.0f}" for point in TABLE_COLUMNS if result.evaluation
             ]
-            row += [f"{result.steps:,}", *(scores or [""] * len(TABLE_COLUMNS)), f"{result.counts['hours']:.2f}"]
+            hours = f"{result.counts['hours']:.2f}" if "hours" in result.counts else ""
+            row += [f"{result.steps:,}", *(scores or [""] * len(TABLE_COLUMNS)), hours]
         lines.append(f"| {' | '.join(row + [''] * (len(head) - len(row)))} |")
         if folder.state == "failed":
             told = f" (`{TRACEBACK}` of the run tells all)" if (folder.path / TRACEBACK).exists() else ""

@@ -13,7 +13,7 @@ from atlantis_exp import terminal
 from atlantis_exp.config import PathsConfig, TrackingConfig
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import COMMIT, RunFolder, all_folders
-from atlantis_exp.tracking.store import Store, StoredRun, brought, forget_lost, patience, publish
+from atlantis_exp.tracking.store import Store, StoredRun, brought, first_line, forget_lost, publish
 from atlantis_exp.tracking.travel import bring, is_here, place
 
 _CHANGES = ("brought", "published")
@@ -67,7 +67,8 @@ def sync(
 def _tell(way: str, looks: Iterable[Look], is_first: bool) -> None:
     """Print what became of runs; counts only at first and where something did. Raises: Fault."""
     counts: Counter[str] = Counter()
-    for outcome, run, reason in looks:
+    for look in looks:
+        outcome, run, reason = (terminal.harmless(text).replace("\n", " ") for text in look)  # a server's among them
         counts[outcome] += 1
         if reason:
             print(f"atlantis_exp: {run}: {outcome}: {reason}", file=sys.stderr, flush=True)
@@ -120,7 +121,7 @@ def _runs(store: Store) -> list[StoredRun]:
         with terminal.working(f"asking {store.uri} for its runs"):
             return store.runs()
     except Exception as error:
-        raise Fault(f"{store.uri} cannot be reached: {_first_line(error)}") from None
+        raise Fault(f"{store.uri} cannot be reached: {first_line(error)}") from None
 
 
 @contextmanager
@@ -136,14 +137,6 @@ def _gone_unless_brought(folder: Path) -> Iterator[None]:
 
 def _reason(error: Exception, store: Store) -> str:
     """What went wrong with one run. Raises: Fault where it is the store that did."""
-    if not isinstance(error, ValueError):  # which is what a run's own files raise
-        try:
-            with patience():
-                store.client.get_experiment(store.experiment_id)
-        except Exception as fault:
-            raise Fault(f"{store.uri} cannot be reached: {_first_line(fault)}") from None
-    return _first_line(error)
-
-
-def _first_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}".partition("\n")[0]
+    if (fault := store.fault(error)) is not None:
+        raise Fault(f"{store.uri} cannot be reached: {first_line(fault)}") from None
+    return first_line(error)

@@ -67,7 +67,8 @@ def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int |
         result = _close(trainer, folder, journal, outcome)
     steps = f"{trainer.counters.steps:,}"
     if outcome != "interrupted":
-        print(f"\n{result.report}\n\nrun {folder.name}: {steps} steps, {trainer.counters.seconds:,.0f} s")
+        told = terminal.harmless(result.report)
+        print(f"\n{told}\n\nrun {folder.name}: {steps} steps, {trainer.counters.seconds:,.0f} s")
     elif stop():
         stop.end(f"run {folder.name} is committed at step {steps}; continue with: {job.command}")
     return stop.signal
@@ -100,8 +101,8 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
                 "with resume=never, which keeps what is there"
             )
         return False
-    print(f"run {folder.name} has ended ({result.outcome} after {result.steps:,} steps):\n")
-    print(result.report)
+    how = f"{result.outcome} after {result.steps:,} steps"
+    print(terminal.harmless(f"run {folder.name} has ended ({how}):\n\n{result.report}"))
     return True
 
 

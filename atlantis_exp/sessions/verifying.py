@@ -22,6 +22,7 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.job import Job, command_line, labels, replaced
+from atlantis_exp.sessions.sweep import terminable
 from atlantis_exp.tracking.publishing import publishing
 from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.fingerprint import fingerprint
@@ -109,24 +110,25 @@ def run_and_kill(start: Callable[[Path], Session], outputs: Path, runs: str, kil
     """
     struck = 0
     outputs.mkdir(parents=True, exist_ok=True)
-    while True:
-        before = generations(outputs, runs)
-        session = start(outputs / _SAID)
-        try:
-            while struck < kills and session.poll() is None:
-                time.sleep(0.01)
-                if generations(outputs, runs) > before:
-                    time.sleep(random.random() * seconds)
-                    break
-            else:
-                if session.wait():
-                    error = (outputs / _SAID).read_text().strip().splitlines()
-                    raise Fault(f"a session under {outputs} failed: {error[-1] if error else 'it said nothing'}")
-                return struck
-        finally:  # also where a signal ends this process: the session, in a group of its own, has not heard it
-            with suppress(ProcessLookupError):  # it has just ended
-                os.killpg(session.pid, signal.SIGKILL)
-        struck += session.wait() == -signal.SIGKILL
+    with terminable():
+        while True:
+            before = generations(outputs, runs)
+            session = start(outputs / _SAID)
+            try:
+                while struck < kills and session.poll() is None:
+                    time.sleep(0.01)
+                    if generations(outputs, runs) > before:
+                        time.sleep(random.random() * seconds)
+                        break
+                else:
+                    if session.wait():
+                        error = (outputs / _SAID).read_text().strip().splitlines()
+                        raise Fault(f"a session under {outputs} failed: {error[-1] if error else 'it said nothing'}")
+                    return struck
+            finally:  # also where a signal ends this process: the session, in a group of its own, has not heard it
+                with suppress(ProcessLookupError):  # it has just ended
+                    os.killpg(session.pid, signal.SIGKILL)
+            struck += session.wait() == -signal.SIGKILL
 
 
 def fingerprints(config: Config, outputs: Path) -> dict[str, str]:

@@ -64,14 +64,14 @@ def catch_up(outputs: Path, server: str | None = None, continued: Path | None = 
     unreachable: set[str] = set()
     for folder in all_folders(outputs):
         try:
-            runs_here = folder.status == "RUNNING" and not brought(folder.path)
-            if runs_here and not folder.is_held:
+            if _runs_here(folder) and not folder.is_held:
                 with suppress(Fault, OSError), folder.held():  # a folder of somebody else's may be read alone
-                    Journal(folder.path).status("KILLED")
-                    print(f"run {folder.name} was killed; the command that started it continues it")
+                    if _runs_here(folder):  # its process may just have ended it
+                        Journal(folder.path).status("KILLED")
+                        print(f"run {folder.name} was killed; the command that started it continues it")
             is_sent = folder.status == "RUNNING" or folder.path == continued
             store = None if is_sent else unfinished(folder.path, outputs)
-        except (Fault, OSError) as error:
+        except (Fault, OSError, ValueError) as error:
             print(f"atlantis_exp: {error}", file=sys.stderr)  # no reason to refuse a command for another run
             continue
         if store is None or store.address in unreachable:
@@ -87,6 +87,10 @@ def catch_up(outputs: Path, server: str | None = None, continued: Path | None = 
             f"atlantis_exp: {uri} lacks parts of {runs} runs; {PROGRAM} sync {quote(f'to={uri}')} sends them",
             file=sys.stderr,
         )
+
+
+def _runs_here(folder: RunFolder) -> bool:
+    return folder.status == "RUNNING" and not brought(folder.path)
 
 
 def how_to_open(outputs: Path) -> str:

@@ -5,6 +5,7 @@ step, time and value), files overwrite themselves by name, runs and models are l
 """
 
 import gzip
+import io
 import json
 import logging
 import math
@@ -16,18 +17,19 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast
 from urllib.parse import urlsplit
 from uuid import UUID, uuid5
 
 from pydantic import AliasChoices, Field, TypeAdapter
 
+from atlantis_exp import terminal
 from atlantis_exp.runs.files import ARTIFACT, SMALL, is_whole, open_file, read_file, write_file
 from atlantis_exp.runs.folder import COMMIT, CONFIG, RESULT, TRACEBACK
 from atlantis_exp.runs.journal import (
@@ -46,6 +48,7 @@ from atlantis_exp.runs.lock import alone
 from atlantis_exp.tracking.views import experiment_tags
 
 if TYPE_CHECKING:
+    import PIL.Image
     from mlflow import MlflowClient
     from mlflow.entities import LoggedModel, Metric, Run
     from mlflow.store.artifact.mlflow_artifacts_repo import MlflowArtifactsRepository
@@ -68,6 +71,7 @@ _PIECE = 2**16
 _PAGES = 1_000  # of 1,000 runs each, that a server may list
 
 _POINTS = 500  # a call at least, where there are so many: fewer cost more each
+_PIXELS = 4_096  # a side, of a picture: a file of some kilobytes can unpack to gigabytes
 _PARAM_LENGTH = 6_000  # characters that MLflow keeps
 _RUN_NAME = "mlflow.runName"
 _PRIMARY = "published.json"
@@ -196,6 +200,18 @@ class Store:
             return None
         return run if run.info.lifecycle_stage == "active" else None
 
+    def fault(self, error: Exception) -> Exception | None:
+        """Returns why the store takes nothing, None where it answers: what raised the error is one folder's fault."""
+        if isinstance(error, ValueError):  # which is what a folder's own files raise
+            return None
+        if isinstance(error, TooSlow) or getattr(error, "error_code", "") == "TEMPORARILY_UNAVAILABLE":
+            return error
+        try:
+            self.client.get_experiment(self.experiment_id)
+        except Exception as fault:
+            return fault
+        return None
+
     def delete_run(self, run_id: str) -> None:
         """Deletes a run and its models, which MLflow would keep."""
         for model in self.models(run_id):
@@ -231,9 +247,9 @@ class Store:
                 with closing(sqlite3.connect(database_file)) as database:
                     database.execute("PRAGMA journal_mode=WAL")  # else one slow reader makes a write fail
             client = MlflowClient(self.uri)
-            with nullcontext() if self.is_local else patience():
-                experiment = client.get_experiment_by_name(self._experiment)
-            if experiment:
+            if not self.is_local:
+                client = cast("MlflowClient", _Patient(client))
+            if experiment := client.get_experiment_by_name(self._experiment):
                 return client, experiment.experiment_id
             # MLflow's own choice would depend on the working directory of whoever comes first.
             location = (self._root / "artifacts" / self._experiment).as_uri() if self.is_local else None
@@ -250,8 +266,8 @@ class TooSlow(Exception):
 
 
 @contextmanager
-def patience() -> Iterator[None]:
-    """Raise TooSlow in the block after `_SECONDS`: a server that sends a byte now and then never times out.
+def patience(more: int = 0) -> Iterator[None]:
+    """Raise TooSlow after `_SECONDS` and some more in the block: a server that drips bytes never times out.
 
     Only in the main thread, where a signal can end a wait.
     """
@@ -259,25 +275,47 @@ def patience() -> Iterator[None]:
         yield
         return
 
+    late: list[TooSlow] = []
+
     def give_up(*_: object) -> None:
-        raise TooSlow(f"the server has not answered in full within {_SECONDS} seconds")
+        late.append(TooSlow(f"the server has not answered in full within {_SECONDS + more} seconds"))
+        raise late[0]
 
     before = signal.signal(signal.SIGALRM, give_up)
-    signal.alarm(_SECONDS)
+    signal.alarm(_SECONDS + more)
     try:
         yield
+    except Exception:
+        if late:  # which MLflow wraps
+            raise late[0] from None
+        raise
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)
+
+
+class _Patient:
+    """A server's client whose calls each have their time; a file that is sent, a second more for each 64 KiB."""
+
+    def __init__(self, client: "MlflowClient") -> None:
+        self._client = client
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        call = getattr(self._client, name)
+
+        def bounded(*arguments: Any, **options: Any) -> Any:
+            sent = os.path.getsize(arguments[1]) if name in ("log_artifact", "log_model_artifact") else 0
+            with patience(sent // _PIECE):
+                return call(*arguments, **options)
+
+        return bounded
 
 
 def _pages(search: "Callable[..., PagedList[P]]") -> "Iterator[PagedList[P]]":
     """The pages of a search, as far as there may be."""
     token: str | None = None
     for _ in range(_PAGES):
-        with patience():
-            page = search(page_token=token)
-        yield page
+        yield (page := search(page_token=token))
         if not (token := page.token):
             return
     raise ValueError(f"the server lists more than {_PAGES:,} pages")
@@ -351,22 +389,25 @@ class Publisher:
         return not self._thread.is_alive()
 
     def _run(self) -> None:
-        delay, failing = self._interval, False
+        delay, failing, told = self._interval, False, set[Path]()
         while True:
             draining = self._draining.is_set()  # asked first: what is committed before a drain is published by it
-            error: Exception | None = None
+            fault: Exception | None = None  # of the store; a folder's own is no reason to skip the others, or to wait
             for folder in self._folders:
                 try:
                     publish(folder, self._store)
-                except Exception as raised:  # one damaged folder is no reason to skip the others
-                    error = error or raised
-            if error is not None:
+                except Exception as error:
+                    if (fault := self._store.fault(error)) is not None:
+                        break
+                    if folder not in told:
+                        told.add(folder)
+                        place = terminal.harmless("/".join(folder.parts[-2:]))
+                        _log.warning("%s cannot be published (%s)", place, first_line(error))
+            if fault is not None:
                 if not failing:
-                    reason = f"{type(error).__name__}: {error}".partition("\n")[0]
+                    reason = first_line(fault)
                     _log.warning("Publishing to MLflow fails (%s); the run goes on and is published later", reason)
                 delay, failing = min(2 * delay, 60.0), True
-                if draining and isinstance(error, ValueError):
-                    return  # a damaged folder, which no waiting mends
             else:
                 if failing:
                     _log.warning("Publishing to MLflow works again and is up to date")
@@ -377,6 +418,11 @@ class Publisher:
                 time.sleep(1.0)
             else:
                 self._draining.wait(delay)
+
+
+def first_line(error: Exception) -> str:
+    """Returns what went wrong, in a line."""
+    return terminal.harmless(f"{type(error).__name__}: {error}".partition("\n")[0])
 
 
 def publish(folder: Path, store: Store, is_primary: bool = True) -> bool:
@@ -474,12 +520,23 @@ def brought(folder: Path) -> "Cursor | None":
     return origin if origin and commit and origin.identity == commit.identity else None
 
 
+def check_parents(folder: Path, parent: str) -> None:
+    """Refuse a parent that is shown under the folder itself, or under itself. Raises: ValueError."""
+    places = [Path(os.path.normpath(folder))]
+    while re.fullmatch(PARENT, parent):
+        place = Path(os.path.normpath(places[-1] / parent))
+        if place in places:
+            raise ValueError(f"{place} is its own parent")
+        places.append(place)
+        commit = None if place.is_symlink() else read_commit(place)
+        parent = commit.parent if commit else ""
+
+
 def _parent_run(folder: Path, store: Store, commit: Commit, is_primary: bool) -> str | None:
     """The run that a folder's is shown under, which is published if it is not yet there."""
-    if not re.fullmatch(PARENT, commit.parent):
-        return None
-    parent = (folder / commit.parent).resolve()
-    if not parent.exists():
+    check_parents(folder, commit.parent)
+    parent = Path(os.path.normpath(folder / commit.parent))
+    if not re.fullmatch(PARENT, commit.parent) or parent.is_symlink() or not parent.exists():
         return None
     publish(parent, store, is_primary)
     cursor = Cursor.read(_note(parent, store, is_primary))
@@ -501,7 +558,7 @@ class Cursor:
         """Returns the folder's cursor in this store, at the start of a found or new run if there is none."""
         cursor = cls.read(note)
         if cursor is None or (cursor.store, cursor.identity) != (store.address, commit.identity):
-            if cursor is not None and cursor.store == store.address and cursor.run_id:
+            if cursor is not None and cursor.store == store.address and cursor.run_id and store.run(cursor.run_id):
                 store.delete_run(cursor.run_id)  # it shows lines that the journal has taken back
             cursor = cls(store.address, commit.identity)
             cursor.save(note)  # should MLflow be out of reach, `unfinished` tells others where it is to go
@@ -635,13 +692,13 @@ class _Mirror:
 
     def _send_image(self, record: Image) -> None:
         # `log_image` with a key would name the files at random, so that an image sent again would be a second one.
-        from mlflow.tracking.multimedia import compress_image_size
-        from PIL.Image import open as open_image
-
-        name = image_name(self._run_id, record)
-        self._send_file(f"{name}.png", read_file(self._artifacts / record.path, ARTIFACT))
-        with open_image(self._artifacts / record.path) as image:
-            self._client.log_image(self._run_id, compress_image_size(image), f"{name}+compressed.webp")
+        name, content = image_name(self._run_id, record), read_file(self._artifacts / record.path, ARTIFACT)
+        try:
+            small = _shrunk(content)
+        except Exception as error:  # whatever PIL makes of it
+            raise ValueError(f"{self._artifacts / record.path} is no PNG of a run: {error}") from None
+        self._send_file(f"{name}.png", content)
+        self._client.log_image(self._run_id, small, f"{name}+compressed.webp")
         self._send_tags({"mlflow.loggedImages": "True"})
 
     def _send_model(self, record: Model) -> None:
@@ -665,6 +722,17 @@ class _Mirror:
                 if model.model_id != model_id:
                     self._client.delete_logged_model_tag(model.model_id, "best")
             self._client.set_logged_model_tags(model_id, {"best": "true"})
+
+
+def _shrunk(content: bytes) -> "PIL.Image.Image":
+    """A PNG, which alone is tried, as small as MLflow's pages show it at first."""
+    from mlflow.tracking.multimedia import compress_image_size
+    from PIL.PngImagePlugin import PngImageFile
+
+    with PngImageFile(io.BytesIO(content)) as image:  # reads the head
+        if max(image.size) > _PIXELS:
+            raise ValueError(f"{image.width:,} x {image.height:,} pixels, more than {_PIXELS:,} a side")
+        return compress_image_size(image)
 
 
 def image_name(run_id: str, record: Image) -> str:

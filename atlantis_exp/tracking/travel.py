@@ -39,9 +39,9 @@ from atlantis_exp.tracking.store import (
     Store,
     StoredRun,
     brought,
+    check_parents,
     files_digest,
     image_name,
-    patience,
     small_files,
 )
 
@@ -82,8 +82,7 @@ def bring(run: StoredRun, folder: Path, store: Store, listed: Collection[str]) -
         ValueError: on what cannot be a run folder's; the folder stays as it was.
         MlflowException, OSError: when the server cannot be reached.
     """
-    with patience():
-        files = store.files(store.client.get_run(run.run_id).info.artifact_uri)
+    files = store.files(store.client.get_run(run.run_id).info.artifact_uri)
     names = files.names(TRAVELS)
     small = {name: files.read(f"{TRAVELS}/{name}", SMALL) for name in (COMMIT, *SMALL_FILES) if name in names}
     if files_digest(small) != run.tags.get(FILES_TAG):
@@ -93,7 +92,9 @@ def bring(run: StoredRun, folder: Path, store: Store, listed: Collection[str]) -
     commit = commit_of(small[COMMIT])
     if commit.offset > ARTIFACT:
         raise ValueError(f"its journal of {commit.offset:,} bytes is longer than {ARTIFACT:,}")
-    _check_parent(folder, commit.parent)
+    if commit.parent and not re.fullmatch(PARENT, commit.parent):
+        raise ValueError(f"its parent {commit.parent!r} is no run folder's place")
+    check_parents(folder, commit.parent)
     local = _Local.of(folder, store)
     decision, start = _decide(local, commit, listed)
     if decision != "brought":
@@ -149,19 +150,6 @@ def _decide(local: _Local, remote: Commit, listed: Collection[str]) -> tuple[Out
         return "brought", local.commit.offset
     was_replaced = local.untouched_from is not None and local.untouched_from not in listed
     return ("brought" if was_replaced else "other"), 0
-
-
-def _check_parent(folder: Path, parent: str) -> None:
-    """Refuse a parent that is no run folder's place, or that is shown under the folder itself."""
-    place = folder = Path(os.path.normpath(folder))
-    while parent:
-        if not re.fullmatch(PARENT, parent):
-            raise ValueError(f"its parent {parent!r} is no run folder's place")
-        place = Path(os.path.normpath(place / parent))
-        if place == folder:
-            raise ValueError("it is its own parent")
-        commit = read_commit(place)
-        parent = commit.parent if commit else ""
 
 
 def _journal(files: Files, start: int, end: int) -> Iterator[bytes]:

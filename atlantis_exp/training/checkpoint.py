@@ -20,7 +20,10 @@ from atlantis_exp.runs.files import CHECKPOINT, SMALL, inside, read_file, read_o
 
 FORMAT = 1
 _SEGMENTS = 64  # of a full memory, about
-_DAMAGED = (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RuntimeError, SafetensorError)
+_DAMAGED = (
+    *(OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RuntimeError),
+    *(MemoryError, SafetensorError),
+)
 """What comes of a state that is not what was saved."""
 
 

@@ -1,5 +1,6 @@
 """The table of evaluated episodes: what is written is what is read."""
 
+import os
 from dataclasses import fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -95,6 +96,15 @@ def test_writing_and_reading_are_inverse(
         again = EpisodeTable.read(path, SOURCES)
     assert_equal(again, table)
     assert again.to_csv() == table.to_csv()
+
+
+def test_a_table_of_many_times_the_episodes_of_any_evaluation_is_small_enough(tmp_path: Path) -> None:
+    head, first, _ = GOLDEN.splitlines(keepends=True)
+    (tmp_path / "episodes.csv").write_text(head + 20_000 * first)
+    assert len(EpisodeTable.read(tmp_path / "episodes.csv").scores) == 20_000
+    os.truncate(tmp_path / "episodes.csv", 2**24 + 1)  # parsed, its cells take many times as much
+    with pytest.raises(ValueError, match="more than 16,777,216"):
+        EpisodeTable.read(tmp_path / "episodes.csv")
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ def test_pipes_in_the_place_of_its_files_hold_nobody_up(tmp_path: Path) -> None:
         write_file(tmp_path / "x", b"")
 
 
-@pytest.mark.parametrize("link", ["", "checkpoints", "a/b/c"])
+@pytest.mark.parametrize("link", ["", "checkpoints", "a/b/c", "published.lock"])
 def test_a_folder_with_a_link_is_not_held_for_writing(tmp_path: Path, link: str) -> None:
     folder, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
     elsewhere.mkdir()
@@ -74,6 +74,20 @@ def test_a_folder_with_a_link_is_not_held_for_writing(tmp_path: Path, link: str)
     with pytest.raises(Fault, match=f"run x: {folder / link} is a link"), held(folder, "run x", 0.0):
         pass
     assert not list(elsewhere.iterdir())
+
+
+def test_a_lock_is_not_opened_through_a_link(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("my work")
+    (tmp_path / "published.lock").symlink_to("thesis.txt")
+    with pytest.raises(OSError, match=r"published\.lock"), alone(tmp_path / "published.lock"):
+        pass
+    assert (tmp_path / "thesis.txt").read_text() == "my work"
+
+
+def test_the_lock_that_optuna_has_in_a_search_is_no_link_of_others(tmp_path: Path) -> None:
+    (tmp_path / "trials.jsonl.lock").symlink_to("trials.jsonl")
+    with held(tmp_path, "search x", 0.0):
+        pass
 
 
 def test_a_folder_is_free_once_its_holder_is_killed(tmp_path: Path) -> None:

@@ -19,12 +19,12 @@ from rich.console import Console
 from atlantis_exp.build import build_emulators
 from atlantis_exp.commands.overrides import check, launcher
 from atlantis_exp.config import Config, PathsConfig
-from atlantis_exp.faults import ConfigError
+from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal, read_commit
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.launchers import BASIC, Launcher
-from atlantis_exp.sessions.launchers.joblib import _shared_cores
+from atlantis_exp.sessions.launchers.joblib import _shared_cores, train_apart
 from atlantis_exp.sessions.launchers.ray import _start
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.training import train
@@ -177,6 +177,36 @@ def test_the_table_follows_the_commits_of_runs(
     assert "20 steps/s" in lines[1]
     assert "left 0:00:0" in lines[1]  # at the speed shown; at the mean, a machine long busy, it would be 40 seconds
     assert "last score 8,000" in lines[1]
+
+
+def test_a_damaged_journal_leaves_the_other_runs_in_the_table(tiny: Compose) -> None:
+    jobs = [Job(tiny(f"seed={seed}")) for seed in (0, 1)]
+    folders = [RunFolder.of(job.config) for job in jobs]
+    for folder in folders:
+        journal = Journal(folder.path)
+        folder.write_config({})
+        journal.metrics({"score/episode": 100.0}, 40)
+        journal.finish()
+    (folders[0].path / "journal.jsonl").write_bytes(b"x" * 200 + b"\n")
+    shown = io.StringIO()
+    LiveTable(jobs, folders, Console(file=shown, width=200)).look()
+    assert "40 of 160 steps" in shown.getvalue()
+
+
+@pytest.mark.parametrize("code", [-signal.SIGKILL, 1])
+def test_a_job_whose_process_dies_after_its_run_has_ended_is_not_marked(
+    tiny: Compose, recorded: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    job = Job(tiny())
+
+    def ends(command: list[str], **_: object) -> "subprocess.CompletedProcess[bytes]":
+        recorded()
+        return subprocess.CompletedProcess(command, code)
+
+    monkeypatch.setattr(subprocess, "run", ends)
+    with pytest.raises(Fault, match=RunFolder.of(job.config).name):
+        train_apart(job)
+    assert RunFolder.of(job.config).state == "done"
 
 
 @pytest.mark.slow

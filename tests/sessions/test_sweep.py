@@ -17,7 +17,7 @@ import pytest
 from atlantis_exp.commands.jobs import words_of
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
-from atlantis_exp.runs.journal import read_commit
+from atlantis_exp.runs.journal import Journal, read_commit
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.sweep import ledger
 from atlantis_exp.sessions.training import train
@@ -41,6 +41,23 @@ def rows(outputs: Path, query: str, *values: Any) -> list[tuple[Any, ...]]:
 def tags(outputs: Path, key: str) -> dict[str, str]:
     """Of the runs that bear it, by name."""
     return dict(rows(outputs, "SELECT name, value FROM tags JOIN runs USING (run_uuid) WHERE key = ?", key))
+
+
+def test_a_result_without_its_hours_has_a_row_without_them(pair: list[Job], recorded: Callable[..., Path]) -> None:
+    for seed in (0, 1):
+        recorded(*SHORT, f"seed={seed}")  # its counts are empty
+    with ledger(pair, ["seed=0,1"]):
+        pass
+    assert tags(pair[0].outputs, "mlflow.note.content")["sweep seed=0,1"].count("| done | 160 |") == 2
+
+
+def test_why_a_run_failed_takes_no_hold_of_the_terminal(
+    tiny: Compose, recorded: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    Journal(recorded()).status("FAILED", "no \x1b]52;c;cm0=\x07device")
+    with ledger([Job(tiny())]):
+        pass
+    assert ": no ]52;c;cm0=device\n" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import Result, RunFolder
 from atlantis_exp.runs.journal import Commit, Journal, adopt, commit_bytes, read_commit
-from atlantis_exp.sessions.syncing import sync
+from atlantis_exp.sessions.syncing import Look, _tell, sync
 from atlantis_exp.tracking import travel
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.tracking.store import Files, Store, TooSlow, _pages, files_digest, publish, unfinished
@@ -473,14 +473,17 @@ def test_a_server_out_of_reach_and_a_damaged_folder_are_one_line_each(
 def test_a_server_that_drips_is_given_up(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A byte now and then keeps every single wait short, and a page token keeps every list going."""
     dripped = bytearray()
+    answers: dict[str, object] = {}
 
     class Drip(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
+            answer = next((json.dumps(answers[path]).encode() for path in answers if path in self.path), b"")
             self.send_response(200)
-            self.send_header("Content-Length", "100000")
+            self.send_header("Content-Length", str(len(answer) or 100_000))
             self.end_headers()
             with suppress(OSError):
-                while True:
+                self.wfile.write(answer)
+                while not answer:
                     self.wfile.write(b" ")
                     dripped.append(0)
                     time.sleep(0.2)
@@ -498,9 +501,21 @@ def test_a_server_that_drips_is_given_up(monkeypatch: pytest.MonkeyPatch, tmp_pa
             Store(tmp_path, "x", uri).files("mlflow-artifacts:/a").read("b", 1_000)
         with pytest.raises(Fault, match="cannot be reached"):
             synced(tmp_path, f"from={uri}")
+        answers |= {"get-by-name": {"experiment": {"experiment_id": "1"}}, "runs/search": {}, "experiments/get?": {}}
+        a_sweep_of_one(tmp_path, "plain")
+        with pytest.raises(Fault, match="cannot be reached: TooSlow"):
+            synced(tmp_path, f"to={uri}")
         server.shutdown()
     assert len(dripped) > 10
     assert time.monotonic() - began < 30
+
+
+def test_what_a_server_calls_a_run_is_one_line_that_a_terminal_does_not_obey(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(Fault, match="1 of 1 runs failed"):
+        _tell("from x", [Look("failed", "a\x1b]52;c;cm0=\x07\nfrom y: 9 runs", "no\x9b2J")], is_first=True)
+    assert capsys.readouterr().err == "atlantis_exp: a]52;c;cm0= from y: 9 runs: failed: no2J\n"
 
 
 def test_lists_and_files_without_end_are_refused(

@@ -233,23 +233,26 @@ def test_a_run_that_is_made_longer_is_done_at_its_new_end(recorded: Callable[...
     assert states == ["done", "running", "interrupted", "interrupted", "failed", "done"]
 
 
-def test_a_session_does_not_outlive_the_one_who_would_kill_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("number", "end"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
+def test_a_session_does_not_outlive_the_one_who_would_kill_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, end: type[BaseException]
+) -> None:
     sessions: list[Session] = []
 
     def start_one(said: Path) -> Session:
         sessions.append(start(("sleep", "60"), said))
         return sessions[0]
 
-    looks = iter([0])  # and then, as if a person pressed Ctrl-C
+    looks = iter([0])
 
     def generations(*_: object) -> int:
-        try:
-            return next(looks)
-        except StopIteration:
-            raise KeyboardInterrupt from None
+        for look in looks:
+            return look
+        signal.raise_signal(number)
+        return 0
 
     monkeypatch.setattr(verifying, "generations", generations)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(end):
         run_and_kill(start_one, tmp_path, "*", 1)
     assert sessions[0].wait() == -signal.SIGKILL
 

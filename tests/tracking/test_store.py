@@ -16,9 +16,10 @@ import PIL.Image
 import pytest
 
 from atlantis_exp.runs.folder import TRACEBACK
-from atlantis_exp.runs.journal import Journal, Metrics, adopt, read
+from atlantis_exp.runs.journal import Journal, Metrics, adopt, read, read_commit
 from atlantis_exp.tracking import store as store_module
-from atlantis_exp.tracking.store import Publisher, Store, publish, unfinished
+from atlantis_exp.tracking.publishing import catch_up
+from atlantis_exp.tracking.store import Cursor, Publisher, Store, publish, unfinished
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -419,6 +420,28 @@ def test_images_are_named_and_sized_as_mlflow_itself_does(tmp_path: Path, store:
     assert len(images(run.info.run_id)) == 2
 
 
+@pytest.mark.parametrize(
+    ("kind", "width", "end", "fault"),
+    [
+        ("EPS", 8, None, "is no PNG"),  # which PIL has Ghostscript draw
+        ("PNG", 4_097, None, "4,097 x 4 pixels"),
+        ("PNG", 8, 45, "is no PNG"),
+        ("PNG", 8, 0, "is no PNG"),
+    ],
+)
+def test_an_image_that_is_no_picture_of_ours_is_a_damaged_folders(
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, kind: str, width: int, end: int | None, fault: str
+) -> None:
+    content = io.BytesIO()
+    PIL.Image.new("L", (width, 4)).save(content, kind)
+    journal = Journal(tmp_path)
+    journal.image("score/heatmap", content.getvalue()[:end], 0)
+    commit(journal)
+    monkeypatch.setattr(subprocess, "check_call", lambda *_, **__: pytest.fail("runs a program"))
+    with pytest.raises(ValueError, match=fault):
+        publish(tmp_path, store)
+
+
 def test_infinite_values_stay_in_the_journal_and_nan_is_shown(tmp_path: Path, root: Path, store: Store) -> None:
     journal = Journal(tmp_path)
     journal.metrics({"up": float("inf"), "down": float("-inf"), "nan": float("nan"), "one": 1.0}, 1)
@@ -566,6 +589,64 @@ def test_a_folder_that_is_a_link_is_not_published(tmp_path: Path, store: Store) 
     with pytest.raises(ValueError, match="run is a link"):
         publish(tmp_path / "run", store)
     assert not (tmp_path / "elsewhere" / "published.json").exists()
+
+
+def test_a_parent_that_is_a_link_is_not_published_and_none(tmp_path: Path, store: Store) -> None:
+    run, sweep = tmp_path / "runs/run", tmp_path / "sweeps/sweep"
+    a_full_journal(tmp_path / "elsewhere")
+    sweep.parent.mkdir()
+    sweep.symlink_to(tmp_path / "elsewhere")
+    adopt(run, sweep)
+    Journal(run).status("FINISHED")
+    publish(run, store)
+    assert not (tmp_path / "elsewhere" / "published.json").exists()
+    assert "mlflow.parentRunId" not in store.client.get_run(run_id(run)).data.tags
+
+
+@pytest.mark.parametrize("parents", ["aa", "abba", "abbccb"])
+@pytest.mark.timeout(60)
+def test_a_folder_under_itself_is_damaged_and_holds_nobody_up(tmp_path: Path, store: Store, parents: str) -> None:
+    for child, parent in zip(parents[::2], parents[1::2], strict=True):
+        folder = tmp_path / "runs" / child
+        Journal(folder).status("FINISHED")
+        (folder / "commit.json").write_bytes(
+            (folder / "commit.json").read_bytes().replace(b'"parent":""', f'"parent":"../../runs/{parent}"'.encode())
+        )
+    with pytest.raises(ValueError, match="its own parent"):
+        publish(tmp_path / "runs" / "a", store)
+
+
+def test_what_begins_anew_is_published_where_the_store_has_lost_its_run(tmp_path: Path, store: Store) -> None:
+    note = tmp_path / "published.json"
+    for _ in range(2):  # as a comparison does each time
+        journal = Journal(tmp_path)
+        journal.metrics({"score": 1.0}, 1)
+        journal.finish()
+        assert publish(tmp_path, store)
+        note.write_text(note.read_text().replace(run_id(tmp_path), "a" * 32))
+
+
+@pytest.mark.timeout(100)
+def test_what_is_a_folders_own_fault_is_one_line_at_once_and_no_reason_to_leave_the_others(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folders = {name: tmp_path / "runs" / name for name in ("label", "lock", "step", "whole")}
+    for name, folder in folders.items():
+        journal = Journal(folder, {"a_b": "x"})
+        journal.metrics({"score": 1.0}, 2**63 if name == "step" else 1)
+        journal.finish()
+        Cursor(Store(tmp_path).address, read_commit(folder).identity).save(folder / "published.json")  # type: ignore[union-attr]
+    mark = folders["label"] / "commit.json"
+    mark.write_bytes(mark.read_bytes().replace(b"a_b", b"a//b"))
+    (folders["lock"] / "published.lock").symlink_to("elsewhere")
+    began = time.monotonic()
+    catch_up(tmp_path)
+    assert time.monotonic() - began < 18  # it would wait 20 s for a store
+    assert unfinished(folders["whole"], tmp_path) is None
+    said = [record.getMessage() for record in caplog.records if record.name == store_module.__name__]
+    assert [line.split(" (")[0] for line in said] == [
+        f"runs/{name} cannot be published" for name in ("label", "lock", "step")
+    ]
 
 
 @pytest.mark.parametrize("damaged", ["", "{", '{"store": "a", "identity": "b", "offset": "many"}'])

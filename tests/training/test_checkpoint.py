@@ -12,6 +12,7 @@ import torch
 
 from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.runs.journal import read_commit
+from atlantis_exp.training import checkpoint
 from atlantis_exp.training.checkpoint import FORMAT, CheckpointError, Checkpoints, _checksum
 from atlantis_exp.training.fingerprint import fingerprint
 from atlantis_exp.training.trainer import Trainer
@@ -105,6 +106,14 @@ def test_a_damaged_file_leads_to_the_generation_before_and_is_said(two_generatio
         again.load(memory)
         again.save({"step": 2}, memory_of(200, of=memory))
         assert restored(copy)[0] == {"step": 2}
+
+
+def test_a_part_that_the_memory_has_no_room_for_is_damage(
+    two_generations: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checkpoint, "read_file", lambda *_: bytearray(2**62))
+    with pytest.raises(CheckpointError, match="damaged"):
+        restored(two_generations)
 
 
 def test_a_flipped_bit_of_a_manifest_is_noticed(two_generations: Path) -> None:

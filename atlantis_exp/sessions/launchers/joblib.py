@@ -81,7 +81,9 @@ def train_apart(job: Job) -> None:
         if code < 0
         else (said or ["it said nothing"])[-1].removeprefix("atlantis_exp: ")
     )
-    if code < 0 or (code == 1 and folder.state != "failed"):  # it could not say so itself
+    if code < 0 or code == 1:
         with suppress(Fault), folder.held():
-            Journal(folder.path).status("KILLED" if code < 0 else "FAILED", reason)
+            has_said_so = code == 1 and folder.state == "failed"
+            if not has_said_so and folder.ended(config.budget.steps) is None:  # else it died after its run's end
+                Journal(folder.path).status("KILLED" if code < 0 else "FAILED", reason)
     raise Fault(f"run {folder.name}: {reason}; see {folder.path / OUTPUT}", exit_code=code if code > 0 else 128 - code)
