@@ -76,11 +76,12 @@ def parse(schema: type[T], tree: Mapping[str, Any]) -> T:
     Raises:
         ConfigError: one line for the first fault, with its dotted key and the nearest valid choice.
     """
+    # Through JSON: its strict mode takes a list for a tuple, which is all that YAML can write.
+    text = json.dumps(tree)
     try:
-        # Through JSON: its strict mode takes a list for a tuple, which is all that YAML can write.
-        return TypeAdapter(schema).validate_json(json.dumps(tree))
-    except ValidationError as error:
-        raise ConfigError(_explain(error.errors(include_url=False), tree)) from None
+        return TypeAdapter(schema).validate_json(text)
+    except ValidationError as error:  # whose keys are JSON's, which are texts
+        raise ConfigError(_explain(error.errors(include_url=False), json.loads(text))) from None
 
 
 def to_dict(config: Any) -> dict[str, Any]:

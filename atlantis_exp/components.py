@@ -6,6 +6,7 @@ count that were admitted, which the command line does and nothing that is read f
 
 import ast
 import hashlib
+import math
 import re
 import sys
 import traceback
@@ -21,6 +22,7 @@ from types import ModuleType
 from typing import Annotated, Any, Final, Literal
 
 from annotated_types import Interval
+from pydantic import TypeAdapter, ValidationError
 
 from atlantis_exp.checking import absolute, nearest
 from atlantis_exp.faults import ConfigError, Fault
@@ -301,11 +303,12 @@ def _sources(reference: str) -> list[Source]:
     if "/" in reference or reference.endswith(".py"):
         return [_file(reference)]
     try:
-        return _sources_of(reference, distribution(reference))
+        package = distribution(reference)
     except (PackageNotFoundError, ValueError):
         names = {each.name for each in distributions() if each.entry_points.select(group=ENTRY_POINTS)}
         hint = nearest(reference, names) if names else "a file is written with its ending, as in ./mynet.py"
         raise ConfigError(f"plugins={reference}: no such distribution is installed; {hint}") from None
+    return _sources_of(reference, package)
 
 
 def _file(reference: str) -> Source:
@@ -399,6 +402,24 @@ class _Reader:
         for fact, example in (("actions", '("NOOP", "FIRE")'), ("score_range", "(0.0, 400.0)")):
             if facts[fact] == KINDS["env"].facts[fact]:  # type: ignore[index]
                 raise self._error(node, f"{fact}: missing; write {fact} = {example}")
+        for each in fields(Game):
+            if each.name in facts:
+                told: Any = each.type
+                try:
+                    TypeAdapter(told).validate_python(facts[each.name], strict=True)
+                except ValidationError:
+                    raise self._error(node, f"{each.name}: should be a {each.type}") from None
+        low, high = facts["score_range"]
+        if not -math.inf < low < high < math.inf:
+            raise self._error(node, f"score_range: should be the lowest score and the highest, not ({low}, {high})")
+        if facts["sources"] and "points" not in self._members(node):
+            raise self._error(node, "sources: need a static method points(reward, ram), which says what each has paid")
+
+    def _members(self, node: ast.ClassDef) -> set[str]:
+        """The names of what a class defines or assigns, what it inherits from in this file included."""
+        members = [member for each in self._lineage(node) for member in each.body]
+        assigned = {_last(target) for member in members if isinstance(member, ast.Assign) for target in member.targets}
+        return assigned | {member.name for member in members if isinstance(member, ast.FunctionDef)}
 
     def _names(self, call: ast.Call) -> list[str]:
         names = [argument.value if isinstance(argument, ast.Constant) else None for argument in call.args]

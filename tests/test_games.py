@@ -152,6 +152,12 @@ class Mine:
         (re.sub("    actions.*\n", "", GAME.format(name="pong")), "actions: missing; write actions = "),
         (re.sub("    score_r.*\n", "", GAME.format(name="pong")), "score_range: missing; write score_range = "),
         (GAME.format(name="pong").replace("(0.0, 100.0)", "[0.0, 1.0]"), "score_range: "),
+        *(
+            (GAME.format(name="pong").replace("(0.0, 100.0)", text), "score_range: should be ")
+            for text in ("(5.0, 2.0)", "(864.0,)", '("a", "b")', "(0.0, 1e999)")
+        ),
+        (GAME.format(name="pong") + "    keys = ('up', 'down')\n", "keys: should be a tuple[tuple[str, str], ...]"),
+        (GAME.format(name="pong") + "    sources = ('bricks',)\n", "sources: need a static method points(reward, ram)"),
         (GAME.format(name="pong") + "    def __init__(self, speed: int = 1): ...\n", "speed: a game has no settings"),
     ],
 )

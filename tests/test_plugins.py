@@ -418,6 +418,11 @@ def test_options_of_one_s_own_come_from_a_folder_and_name_no_code(
     for text, reason in {
         "hydra: {callbacks: {x: {_target_: os.system}}}": r"sets hydra\.callbacks, which may name code",
         "hydra: {launcher: {_target_: os.system}}": r"sets hydra\.launcher",
+        "hydra: {overrides: {task: ['plugins=[mynet.py]']}}": r"sets hydra\.overrides",
+        "hydra: {overrides: {task: null}}": r"hydra\.overrides\.task|sets hydra\.overrides",
+        "hydra: {job: {env_set: {PYTHONPATH: own}}}": r"sets hydra\.job",
+        "hydra: {job: {chdir: true}}": r"sets hydra\.job",
+        "hydra: {job: {env_copy: [PATH]}}": r"sets hydra\.job",
         "plugins: [./mynet.py]": "names plugins; only the command line may",
         "optimizer: {_target_: os.system}": r"optimizer\._target_: no such key",
     }.items():
@@ -428,6 +433,39 @@ def test_options_of_one_s_own_come_from_a_folder_and_name_no_code(
     (own / "model" / "cnn.yaml").unlink()
     (own / "hydra").mkdir()
     assert "its group hydra/ would name code" in said("--config-dir=own", "seed=1")
+
+
+def test_an_installed_plugin_that_cannot_be_read_is_not_called_missing(packaged: Path, said: Said) -> None:
+    (packaged / "nets.py").unlink()
+    assert re.search(r"names mypackage\.nets, which is not there", said("plugins=atlantis-mynet", "--cfg", "job"))
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (b"width:\t[\n\t1", r"wide\.yaml"),
+        (b"width: [1", r"wide\.yaml"),
+        (b"width: \xff", "UnicodeDecodeError"),
+        (b"width: !!python/name:os.system", r"wide\.yaml"),
+        (b"defaults: [cnn]\nwidth: !!binary aGVsbG8=", "own: TypeError"),
+        (b"defaults: 3", "ValueError"),
+        (b"defaults: [wide]", "RecursionError"),
+        (b"width: " + b"[" * 3_000 + b"]" * 3_000, "RecursionError"),
+        (b"defaults: [cnn]\n1: 2", r"model\.1: no such key"),
+    ],
+    ids=["tab", "bracket", "byte", "tag", "binary", "defaults", "itself", "nested", "number"],
+)
+def test_a_damaged_option_of_one_s_own_is_one_line(text: bytes, reason: str, tmp_path: Path, said: Said) -> None:
+    own = tmp_path / "own"
+    (own / "model").mkdir(parents=True)
+    (own / "model" / "wide.yaml").write_bytes(text)
+    assert re.search(reason, said(f"--config-dir={own}", "model=wide", "--cfg", "job"))
+
+
+def test_a_plugin_s_settings_that_are_nested_too_deeply_are_one_line(plugins: Path, said: Said) -> None:
+    (plugins / "conf" / "model").mkdir(parents=True, exist_ok=True)
+    (plugins / "conf" / "model" / "mynet.yaml").write_text("width: " + "[" * 3_000 + "]" * 3_000)
+    assert re.search(r"conf/model/mynet\.yaml: ", said("model=mynet", "plugins=mynet.py", "--cfg", "job"))
 
 
 HOSTILE = """

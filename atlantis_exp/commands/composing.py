@@ -116,7 +116,7 @@ def _option(component: components.Component) -> dict[str, Any]:
     if path.is_file():
         try:
             values = OmegaConf.to_container(OmegaConf.load(path))
-        except (OSError, UnicodeDecodeError, YAMLError, OmegaConfBaseException) as error:
+        except (OSError, ValueError, RecursionError, YAMLError, OmegaConfBaseException) as error:
             raise ConfigError(f"{path}: {' '.join(str(error).split())}") from None
         if not isinstance(values, dict) or "defaults" in values:
             raise ConfigError(f"{path}: should hold settings, KEY: VALUE a line, and no defaults list")

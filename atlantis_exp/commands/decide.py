@@ -2,17 +2,18 @@
 
 import dataclasses
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache, partial
 from typing import TYPE_CHECKING, Annotated
 
+from hydra.core.override_parser.types import Glob
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.compare import margin
 from atlantis_exp.commands.jobs import training_of
-from atlantis_exp.commands.overrides import check, read_flags, read_override, swept
+from atlantis_exp.commands.overrides import check, key_of, read_flags, read_override, refuse_twice, swept, values_of
 from atlantis_exp.config import FREE, STRICT, Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import command_line
@@ -39,7 +40,11 @@ class DecideConfig(Config):
 
 _OWN = {field.name for field in dataclasses.fields(DecideConfig)} - {field.name for field in dataclasses.fields(Config)}
 _CLOSED = _OWN | FREE | {"seed", "evaluation"}
-_LAUNCHER = ("hydra/launcher=", "hydra.launcher.")
+
+
+def _launchers(texts: Iterable[str]) -> list[str]:
+    """The overrides that choose a launcher and set it up."""
+    return [text for text in texts if key_of(text).startswith(("hydra/launcher", "hydra.launcher."))]
 
 
 def _first_contender(arguments: list[str]) -> list[str]:
@@ -47,13 +52,14 @@ def _first_contender(arguments: list[str]) -> list[str]:
     texts, is_sweep = read_flags(arguments)
     if is_sweep:
         raise ConfigError("-m: decide plans its own sweeps; drop -m")
+    refuse_twice(arguments)
     for text in texts:
-        key, _, value = text.partition("=")
-        if key == "seed":
+        override = read_override(text)
+        if override.key_or_group == "seed":
             raise ConfigError(f"{text}: decide trains seeds from 0 on, as many as it needs; drop it")
-        if key == "resume" and value != "auto":
+        if override.key_or_group == "resume" and override.value() != "auto":
             raise ConfigError(f"{text}: decide goes on with the runs that are there; drop it")
-    dropped = (*swept(arguments), *(text for text in texts if text.startswith(_LAUNCHER)))
+    dropped = (*swept(arguments), *_launchers(texts))
     return [argument for argument in arguments if argument not in dropped]
 
 
@@ -79,17 +85,18 @@ def request_of(asked: Asked[DecideConfig]) -> "Request":
             raise ConfigError(
                 "experiment: a preset is no single key; name those that differ, as in objective=dqn,quantile"
             )
-        if not (override.is_choice_sweep() or override.is_range_sweep()):
+        if not override.is_discrete_sweep() or isinstance(override.value(), Glob):
             raise ConfigError(f"{text}: no list of values; write them out, as in model=cnn,resnet_fast")
-        choices.append([f"{text.split('=', 1)[0]}={value}" for value in override.sweep_string_iterator()])
+        choices.append([f"{text.split('=', 1)[0]}={value}" for value in values_of(override)])
     contenders = list(itertools.product(*choices))
     if len(contenders) < 2:
         raise ConfigError("nothing to decide between: give a key several values, as in model=cnn,resnet_fast")
     texts = read_flags(asked.typed)[0]  # as typed: Hydra has put values in the place of ${...}
-    shared = [text for text in texts if text not in several and not text.startswith(("hydra.", "hydra/"))]
+    launchers = _launchers(texts)
+    shared = [text for text in texts if text not in (*several, *launchers)]
     fixed = [text for text in shared if text.lstrip("+~").split("=")[0].split(".")[0] not in _OWN]
     flags = [text for text in asked.typed if text.startswith("--config-dir=")]
-    launcher = [*flags, *(text for text in asked.typed if text.startswith(_LAUNCHER))]
+    launcher = [*flags, *launchers]
     check("config", Config, ["-m", *launcher, *several, *fixed])
     delta, relative = margin(config.delta)
     keys = tuple(read_override(text).key_or_group for text in several)

@@ -8,15 +8,18 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from hydra import compose
 from hydra._internal.utils import get_args_parser
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, MissingConfigException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
+from yaml import YAMLError
 
 from atlantis_exp.checking import absolute, flatten, nearest
 from atlantis_exp.commands import CONF
@@ -57,27 +60,35 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
                 _check_launcher(config_name, hydras)
             jobs = {tuple(job): _check_job(config_name, schema, job, own) for job in _jobs(overrides)}
             if own is not None:
-                _refuse_settings_of_hydra(config_name, own, jobs)
+                _refuse_settings_of_hydra(config_name, own, texts, jobs)
             return jobs
     except (HydraException, OmegaConfBaseException) as error:
         reason = f": {error.__cause__}" if isinstance(error.__cause__, OmegaConfBaseException) else ""
         raise ConfigError(" ".join(re.split("Config search path|full_key:", f"{error}{reason}")[0].split())) from None
+    except ConfigError:
+        raise
+    except (YAMLError, ValueError, TypeError, RecursionError) as error:  # of a file that Hydra and OmegaConf trusted
+        if own is None:
+            raise
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"--config-dir={own}: {type(error).__name__}: {reason}") from None
 
 
 def refuse_twice(arguments: Sequence[str]) -> None:
     """Refuse a key that a person gave two values, of which Hydra would take the last. Raises: ConfigError."""
     given: dict[str, str] = {}
     for text in read_flags(arguments)[0]:
-        if (before := given.setdefault(_key(read_override(text)), text)) != text:
+        if (before := given.setdefault(key_of(text), text)) != text:
             raise ConfigError(f"{text}: {before} says something else; write one of the two")
 
 
 def _refuse_hydras(override: Override) -> None:
     """Let pass what chooses a launcher and sets it up: anything else of Hydra's names code or places."""
-    key = override.key_or_group
+    key = _key(override)
     if key == "hydra.mode":
         raise ConfigError(f"{override.input_line}: write -m for a sweep")
-    if override.is_delete() or (key != "hydra/launcher" and not key.startswith("hydra.launcher.")):
+    is_choice = key == "hydra/launcher" and isinstance(override.value(), str)
+    if override.is_delete() or not (is_choice or key.startswith("hydra.launcher.")):
         raise ConfigError(
             f"{override.input_line}: of Hydra's own, hydra/launcher=NAME and hydra.launcher.KEY=VALUE pass"
         )
@@ -123,7 +134,9 @@ def _check_launcher(config_name: str, overrides: list[Override]) -> None:
         key = ".".join(override.key_or_group.split(".")[:3])  # what is below, the user names
         if key.startswith("hydra.launcher.") and key not in keys:
             raise ConfigError(f"{text}: no such key; {nearest(key, keys)}")
-    compose(config_name, list(texts), return_hydra_config=True)
+    settings = compose(config_name, list(texts), return_hydra_config=True).hydra
+    if OmegaConf.select(settings, "launcher.n_jobs") == 0:
+        raise ConfigError("hydra.launcher.n_jobs=0: should be how many jobs at a time, or -1 for one a core")
 
 
 def read_flags(arguments: Sequence[str]) -> tuple[list[str], bool]:
@@ -178,8 +191,14 @@ def read_override(text: str) -> Override:
         ) from None
 
 
+def key_of(text: str) -> str:
+    """What an override is about, as `sampler@samplers.uniform` of `++sampler@samplers.uniform=top_half`, however it is
+    written. Raises: ConfigError."""
+    return _key(read_override(text))
+
+
 def _is_hydras(override: Override) -> bool:
-    return override.key_or_group.startswith(("hydra.", "hydra/"))
+    return re.match(r"hydra([./]|$)", override.key_or_group) is not None
 
 
 def _jobs(overrides: list[Override]) -> Iterator[list[str]]:
@@ -188,11 +207,22 @@ def _jobs(overrides: list[Override]) -> Iterator[list[str]]:
     for override in overrides:
         if override.is_sweep_override():
             key = str(override.input_line).split("=", 1)[0]
-            choices.append([f"{key}={value}" for value in override.sweep_string_iterator()])
+            choices.append([f"{key}={value}" for value in values_of(override)])
         else:
             choices.append([str(override.input_line)])
     for combination in itertools.product(*choices):
         yield list(combination)
+
+
+def values_of(override: Override) -> list[str]:
+    """The values that an override lists. Raises: ConfigError where there are none."""
+    try:
+        values = [*override.sweep_string_iterator()]
+    except ValueError as error:  # a range in steps of 0
+        raise ConfigError(f"{override.input_line}: {error}") from None
+    if not values:
+        raise ConfigError(f"{override.input_line}: there is no value in it")
+    return values
 
 
 def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | None) -> T:
@@ -275,18 +305,28 @@ def _check_config_dir(folder: Path) -> None:
             raise ConfigError(f"{taken[0]}: {group.name}={taken[0].stem} is ours and is not replaced; rename yours")
 
 
-def _refuse_settings_of_hydra(config_name: str, folder: Path, jobs: Iterable[Sequence[str]]) -> None:
+def _refuse_settings_of_hydra(
+    config_name: str, folder: Path, typed: Sequence[str], jobs: Iterable[Sequence[str]]
+) -> None:
     """Raise ConfigError where options of a person's own change what Hydra does, which is to run code."""
-    plain = _hydras_own(config_name, [])
-    for job in jobs:
-        if changed := sorted(key for key, value in _hydras_own(config_name, job).items() if value != plain.get(key)):
+    hydras = [text for text in typed if _is_hydras(read_override(text))]
+    plain = _hydras_own(config_name, hydras)
+    # A sweep itself is composed, too, with the groups that have several options as they are without.
+    for texts in (typed, *([*hydras, *job] for job in jobs)):
+        if changed := sorted(key for key, value in _hydras_own(config_name, texts).items() if value != plain.get(key)):
             raise ConfigError(f"--config-dir={folder}: sets hydra.{changed[0]}, which may name code; drop it there")
 
 
-def _hydras_own(config_name: str, texts: Sequence[str]) -> dict[str, object]:
-    settings = OmegaConf.to_container(compose(config_name, list(texts), return_hydra_config=True).hydra, resolve=False)
-    assert isinstance(settings, dict)
-    return {str(key): value for key, value in settings.items() if key not in ("job", "overrides", "runtime")}
+def _hydras_own(config_name: str, texts: Sequence[str]) -> dict[str, Any]:
+    """Hydra's settings without what follows from the overrides of ours in `texts` alone."""
+    composer = GlobalHydra.instance().hydra
+    assert composer is not None
+    composed = composer.compose_config(config_name, list(texts), RunMode.MULTIRUN, validate_sweep_overrides=False)
+    settings: Any = OmegaConf.to_container(composed.hydra, resolve=False)
+    del settings["job"]["override_dirname"], settings["runtime"]["choices"]
+    typed = [text for text in texts if not _is_hydras(read_override(text))]
+    settings["overrides"]["task"] = settings["overrides"]["task"] != typed
+    return {str(key): value for key, value in settings.items()}
 
 
 def _located(match: re.Match[str]) -> str:

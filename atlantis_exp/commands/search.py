@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.jobs import training_of
-from atlantis_exp.commands.overrides import swept
+from atlantis_exp.commands.overrides import refuse_twice, swept
 from atlantis_exp.config import FREE, STRICT, Config, Count
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.sessions.job import command_line
@@ -52,6 +52,7 @@ def _without_searched(arguments: list[str]) -> list[str]:
     """Leave out the keys that are given several values, which are those to search."""
     if {"-m", "--multirun"} & set(arguments):
         raise ConfigError("-m: a search is no sweep, it tries one set of values after the other; drop -m")
+    refuse_twice(arguments)
     searched = swept(arguments)
     return [argument for argument in arguments if argument not in searched]
 

@@ -8,7 +8,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 
 from atlantis_exp.commands.app import Asked
 from atlantis_exp.commands.jobs import job_of
-from atlantis_exp.commands.overrides import check, read_override
+from atlantis_exp.commands.overrides import check, key_of, read_flags, read_override
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import Job
@@ -29,11 +29,15 @@ def read_space(texts: Mapping[str, str], closed: set[str]) -> Space:
 
 
 def _read(key: str, text: str, closed: set[str]) -> CategoricalDistribution | FloatDistribution | IntDistribution:
+    override = read_override(f"{key}={text}")
+    if override.key_or_group != key:  # as `++seed` or `sampler@samplers.uniform`, which MLflow takes no name from
+        raise ConfigError(
+            f"{key}={text}: not to be searched; write a key or a group alone, as in {override.key_or_group}"
+        )
     if key.split(".")[0] in closed:
         raise ConfigError(
             f"{key}={text}: not to be searched; it says how trials are run or measured, not what is trained"
         )
-    override = read_override(f"{key}={text}")
     values = override.value()
     if not override.is_sweep_override() or isinstance(values, Glob):
         raise ConfigError(f"{key}={text}: no set of values; write choice(a, b), range(1, 9) or interval(0.1, 0.9)")
@@ -62,7 +66,7 @@ def check_space(space: Space, overrides: Sequence[str]) -> Job:
     Raises:
         ConfigError: for the first that is not valid, or a key that has a value already.
     """
-    fixed = {text.split("=")[0] for text in overrides}
+    fixed = {key_of(text) for text in read_flags(overrides)[0]}
     if twice := sorted(fixed & space.keys()):
         raise ConfigError(f"{twice[0]}: has one value and is to be searched; drop one of them")
     ends = {

@@ -44,7 +44,7 @@ _SECONDS = 1.0  # of a measurement
 
 
 def check(job: Job, small: Job, references: Sequence[Job]) -> None:
-    """Try every contract on the components of a job, measure its network and the references', and print two tables.
+    """Try every contract on the components of a job and, where all are kept, measure its network and the references'.
 
     small: the same components in a training of seconds, which is killed and continued.
 
@@ -65,11 +65,11 @@ def check(job: Job, small: Job, references: Sequence[Job]) -> None:
             kind = "" if isinstance(error, Fault) else f"{type(error).__name__}: "
             table.add_row(part, contract, "BROKEN", kind + reason)
     terminal.console(least=120).print(table)
+    if broken:
+        raise Fault(f"broken: {', '.join(broken)}")
     with terminal.working("measuring what the networks cost"):
         costs = _costs([job, *references])
     terminal.console(least=120).print(costs)
-    if broken:
-        raise Fault(f"broken: {', '.join(broken)}")
 
 
 def trials(config: Config, small: Job) -> Iterator[tuple[str, str, Callable[[], None]]]:

@@ -1,6 +1,8 @@
 """Any player played, its report printed, and the evaluation kept as a run of its own."""
 
-from collections.abc import Collection, Mapping
+import shutil
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -77,8 +79,9 @@ def evaluate(
     facts = {**source, "step": step, "evaluation": to_dict(evaluation), "env": to_dict(trained.env)}
     recorded = RunFolder(outputs / "evaluations" / f"{name}-at-{step}-{digest(facts)[:6]}")
     shown = labels(f"evaluation of {title} at {step} {digest(facts)[:6]}", config_colour(trained), "evaluation")
-    played = _play(f"{name} at step {step:,}", actor, trained.env, evaluation)
-    _record(recorded, facts, played, tracking, outputs, shown, command)
+    with _held(recorded):
+        played = _play(f"{name} at step {step:,}", actor, trained.env, evaluation)
+        _record(recorded, facts, played, tracking, outputs, shown, command)
     if card:
         table = side_by_side(card, evaluation, [episode.score for episode in played[0].episodes])
         terminal.console(least=130).print(table)
@@ -107,9 +110,10 @@ def play_baseline(
         "tracking": to_dict(tracking),
         "paths": to_dict(paths),
     }
-    played = _play(f"{agent.name} player on {env.id}", build_baseline(agent, env), env, evaluation)
-    shown = labels(title, run_colour(agent.name), "baseline")
-    _record(RunFolder(outputs / "runs" / name), facts, played, tracking, outputs, shown, command)
+    folder, shown = RunFolder(outputs / "runs" / name), labels(title, run_colour(agent.name), "baseline")
+    with _held(folder):
+        played = _play(f"{agent.name} player on {env.id}", build_baseline(agent, env), env, evaluation)
+        _record(folder, facts, played, tracking, outputs, shown, command)
 
 
 def play(
@@ -128,20 +132,10 @@ def play(
     """
     outputs = Path(paths.outputs)
     catch_up(outputs, tracking.uri)
-    low, high = (env.frameskip, env.frameskip + 1) if isinstance(env.frameskip, int) else env.frameskip
-    game, progress = facts_of(env.game), Progress()
-    progress.say(f"{player} plays {env.title}: {game.keys_in_words}")
-    window = Window(env.title, game, 60 / ((low + high - 1) / 2), scale)  # steps a second, on average
-    actor, emulators = build_person(env, window.choose)
-    evaluator = build_evaluator(env, evaluation)
-    try:
-        played = evaluator(actor, evaluation.episodes, progress, lambda: window.closed, emulators)
-    except Stopped:
-        raise Fault("the window was closed before the last episode ended; nothing is recorded") from None
-    finally:
-        window.close()
     names = (f"human-{player}-{env.id.rsplit('/')[-1]}-{number}" for number in count(1))
     folder = RunFolder(next(path for name in names if not (path := outputs / "runs" / name).exists()))
+    low, high = (env.frameskip, env.frameskip + 1) if isinstance(env.frameskip, int) else env.frameskip
+    game, progress = facts_of(env.game), Progress()
     facts = {
         "player": player,
         "scale": scale,
@@ -151,7 +145,29 @@ def play(
         "paths": to_dict(paths),
     }
     shown = labels(folder.name, run_colour("human"), "human")
-    _record(folder, facts, (played, evaluator.film(played, progress)), tracking, outputs, shown, command)
+    with _held(folder):
+        progress.say(f"{player} plays {env.title}: {game.keys_in_words}")
+        window = Window(env.title, game, 60 / ((low + high - 1) / 2), scale)  # steps a second, on average
+        actor, emulators = build_person(env, window.choose)
+        evaluator = build_evaluator(env, evaluation)
+        try:
+            played = evaluator(actor, evaluation.episodes, progress, lambda: window.closed, emulators)
+        except Stopped:
+            raise Fault("the window was closed before the last episode ended; nothing is recorded") from None
+        finally:
+            window.close()
+        _record(folder, facts, (played, evaluator.film(played, progress)), tracking, outputs, shown, command)
+
+
+@contextmanager
+def _held(folder: RunFolder) -> Iterator[None]:
+    """Hold a run's folder, which is gone again where nothing was recorded: no game is played that it could not keep."""
+    with folder.held():
+        try:
+            yield
+        finally:
+            if not folder.has_started:
+                shutil.rmtree(folder.path)
 
 
 def _play(what: str, actor: Actor, env: EnvConfig, evaluation: EvaluationConfig) -> tuple[Evaluation, bytes | None]:
@@ -171,10 +187,10 @@ def _record(
     shown: Mapping[str, str],
     command: str,
 ) -> None:
-    """Print an evaluation as the report does, and keep it as a run of its own; `facts` are its params."""
+    """Print an evaluation as the report does, and keep it as a run of its own, held already; `facts` are its params."""
     evaluation, video = played
     print(f"\n{evaluation.report()}\n")
-    with folder.held(), publishing(folder, tracking, outputs, shown) as journal:
+    with publishing(folder, tracking, outputs, shown) as journal:
         folder.write_config(facts)
         journal.params({key: str(value) for key, value in flatten(facts).items()})
         journal.tags({**provenance(command), "policy": evaluation.policy})

@@ -1,5 +1,6 @@
 """A window in which a person plays."""
 
+import os
 from typing import TYPE_CHECKING
 
 from atlantis_exp.faults import Fault
@@ -27,10 +28,18 @@ class Window:
             self._surface = pygame.display.set_mode((160 * scale, 210 * scale))
         except pygame.error as error:
             raise Fault(f"play needs a screen: {error}") from None
+        # Where it finds no screen SDL draws into memory, unasked.
+        if "SDL_VIDEODRIVER" not in os.environ and pygame.display.get_driver() in ("offscreen", "dummy"):
+            raise Fault("play needs a screen: there is none here")
         pygame.display.set_caption(f"{title}: {game.keys_in_words}")
-        self._actions = {  # in the order of precedence
-            pygame.key.key_code(key): game.actions.index(action) for key, action in game.keys if action in game.actions
-        }
+        try:
+            self._actions = {  # in the order of precedence
+                pygame.key.key_code(key): game.actions.index(action)
+                for key, action in game.keys
+                if action in game.actions
+            }
+        except ValueError:
+            raise Fault(f"play: pygame does not know all keys of {game.rom}: {', '.join(dict(game.keys))}") from None
         self._clock = pygame.time.Clock()
         self._steps_per_second = steps_per_second
         self.closed = False

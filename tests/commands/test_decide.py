@@ -1,9 +1,13 @@
 """The verb decide: what it refuses before anything is written, each in one line."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+from atlantis_exp.commands.decide import VERB
+from atlantis_exp.faults import ConfigError
 
 Command = Callable[..., int]
 
@@ -42,6 +46,7 @@ Command = Callable[..., int]
         (("model=cnn,resnet", "look=now"), "look=now: no such key"),
         (("model=cnn,resnet", "evaluation.at_end=false"), "evaluation.at_end=false: contenders are compared by the "),
         (("model=cnn,resnet", "hydra/launcher=joblb"), "In 'hydra/config': Could not find 'hydra/launcher/joblb'"),
+        (("model=glob(*)",), "model=glob(*): no list of values; write them out"),
     ],
 )
 @pytest.mark.thinned(8)
@@ -53,6 +58,19 @@ def test_a_question_that_cannot_be_decided_is_one_line_and_code_2_and_leaves_not
     assert error.startswith(f"atlantis_exp: {line}")
     assert error.count("\n") == 1
     assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        ("model=cnn model=cnn,resnet", "model=cnn,resnet: model=cnn says something else"),
+        ("model=cnn,resnet ++seed=3", "++seed=3: decide trains seeds from 0 on"),
+        ("model=cnn,resnet ++resume=never", "++resume=never: decide goes on"),
+    ],
+)
+def test_a_key_is_refused_however_it_is_written(words: str, reason: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(reason)):
+        VERB.rewrite(words.split())
 
 
 def test_help_says_what_decide_takes(command: Command, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,10 +4,12 @@ import re
 from typing import Any
 
 import pytest
+from hydra import compose
 
 from atlantis_exp.commands import VERBS
 from atlantis_exp.commands.baseline import BaselineConfig
 from atlantis_exp.commands.compare import CompareConfig
+from atlantis_exp.commands.composing import composing
 from atlantis_exp.commands.evaluate import EvaluateConfig
 from atlantis_exp.commands.export import ExportConfig
 from atlantis_exp.commands.new import NewConfig
@@ -163,7 +165,8 @@ MISTAKES = [  # what is written, and what the one line must hold
             *("hydra.sweeper._target_=os.system", "hydra.callbacks.x._target_=os.system", "hydra/sweeper=basic"),
             *("hydra.job_logging.version=1", "hydra.searchpath=[file:///tmp]", "hydra.run.dir=/tmp/x"),
             *("hydra.output_subdir=x", "hydra.job.chdir=true", "hydra.verbose=[a,b]", "hydra.sweep.dir=/tmp/x"),
-            *("~hydra.launcher", "hydra.launcher={a:1}"),
+            *("~hydra.launcher", "hydra.launcher={a:1}", "hydra={verbose:true}", "+hydra={a:1}", "hydra=basic"),
+            "hydra/launcher@hydra.job_logging=basic",
         )
     ),
     ("--resolve", "--resolve", "--cfg job"),
@@ -229,6 +232,28 @@ def test_a_mistake_is_one_line_that_names_the_key_and_what_would_be_right(line: 
 def test_a_plugin_of_an_unknown_user_is_one_line_before_hydra_reads_it() -> None:
     with pytest.raises(ConfigError, match=r"^plugins=~nobodyhere/mynet\.py: there is no such user"):
         located(["plugins=~nobodyhere/mynet.py"])
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("seed=range(0)", "seed=range(0): there is no value in it"),
+        ("seed=range(0,1,0)", "seed=range(0,1,0): range() arg 3 must not be zero"),
+        ("hydra/launcher=null", "hydra/launcher=null: of Hydra's own, hydra/launcher=NAME"),
+        ("hydra/launcher=joblib hydra.launcher.n_jobs=0", "hydra.launcher.n_jobs=0: should be how many jobs at a time"),
+    ],
+)
+def test_a_sweep_that_cannot_be_is_one_line(line: str, reason: str) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    with pytest.raises(ConfigError, match=f"^{re.escape(reason)}"):
+        check("config", Config, ["-m", *line.split()])
+
+
+@pytest.mark.parametrize(("verb", "overrides"), [("query", []), ("new", []), ("config", ["paths.outputs=/o"])])
+def test_every_verb_s_sweep_has_a_folder(verb: str, overrides: list[str]) -> None:
+    with composing():
+        folder = compose(verb, overrides, return_hydra_config=True).hydra.sweep.dir
+    assert re.search(r"^/o/sweeps/" if overrides else r"outputs/sweeps/", folder)
 
 
 @pytest.mark.parametrize("line", ["seed=1 seed=2", "model=cnn model=resnet", "-m seed=0,1 seed=2", "seed=1 +seed=2"])

@@ -51,6 +51,9 @@ def test_a_space_is_written_as_for_hydras_optuna_sweeper(text: str, drawn: BaseD
         ("", "optimizer.lr=0.1", "no set of values; write choice"),
         ("", "model=glob(*)", "no set of values; write choice"),
         ("", "seed=0,1", "not to be searched"),
+        ("", "++seed=0,1", "not to be searched; write a key or a group alone, as in seed"),
+        ("", "sampler@samplers.uniform=uniform,top_half", "not to be searched"),
+        ("++optimizer.lr=0.1", "optimizer.lr=0.1,0.2", "optimizer.lr: has one value and is to be searched"),
         ("", "evaluation.epsilon=0.1,0.2", "not to be searched"),
         ("", "trials=5,10", "not to be searched"),
         ("optimizer=adam", "optimizer=adam,adamw", "optimizer: has one value and is to be searched"),
@@ -77,6 +80,7 @@ def test_an_impossible_space_is_refused_in_one_line_before_anything_starts(
     [
         ("trials=2", "nothing to search: give a key several values"),
         ("-m optimizer=adam,rmsprop", "-m: a search is no sweep"),
+        ("optimizer=adam optimizer=adam,rmsprop", "optimizer=adam says something else"),
         ("modle=cnn optimizer=adam,rmsprop", "did you mean 'model'?"),
         ("optimizer=adam,rmsprop evaluation.at_end=false", "evaluation.at_end=false: a search compares"),
         ("space=optimzer", "did you mean 'optimizer'?"),

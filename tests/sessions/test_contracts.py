@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,8 @@ import pytest
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.components import admit
 from atlantis_exp.config import Config
+from atlantis_exp.faults import Fault
+from atlantis_exp.sessions import contracts
 from atlantis_exp.sessions.contracts import trials
 from atlantis_exp.sessions.job import Job, replaced
 
@@ -121,6 +124,16 @@ def test_a_breach_is_named(
     for wanted in contracts:
         assert any(contract.startswith(wanted) for contract in broken), broken
     assert bool(broken) == bool(contracts)
+
+
+def test_what_is_broken_is_said_before_anything_is_measured(
+    tiny: Callable[..., Config], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(contracts, "trials", lambda *_: [("model=mine", "learns", partial(int, "x"))])
+    monkeypatch.setattr(contracts, "_costs", lambda _: pytest.fail("measured"))
+    job = Job(tiny())
+    with pytest.raises(Fault, match=r"^broken: model=mine: learns$"):
+        contracts.check(job, job, [])
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ The person's window is SDL's dummy screen here.
 
 import csv
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -20,10 +21,12 @@ from atlantis_exp.commands.composing import checked
 from atlantis_exp.commands.play import PlayConfig
 from atlantis_exp.comparison.gather import gather
 from atlantis_exp.faults import Fault
+from atlantis_exp.sessions import evaluating
 from atlantis_exp.sessions.evaluating import play, play_baseline
 from atlantis_exp.sessions.reporting import report
 from atlantis_exp.sessions.window import Window
 
+Capture = pytest.CaptureFixture[str]
 Command = Callable[..., int]
 T = TypeVar("T")
 
@@ -118,6 +121,17 @@ def test_a_held_button_scores_2000_and_the_run_holds_its_report_table_picture_an
     assert "2,000" in table
 
 
+@pytest.mark.usefixtures("pygame")
+@pytest.mark.parametrize("words", ["baseline agent=constant", "play"])
+def test_no_game_is_played_where_nothing_can_be_recorded(
+    words: str, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(evaluating, "build_evaluator", lambda *_: pytest.fail("played"))
+    assert command(*words.split(), "tracking=none", f"paths.outputs={tmp_path}/file") == 1
+    assert re.fullmatch(r"atlantis_exp: .*/file.*\n", capsys.readouterr().err)
+
+
 @pytest.fixture
 def pygame(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
@@ -173,7 +187,7 @@ def test_closing_the_window_ends_the_run_and_records_nothing(pygame: Any, tmp_pa
     pygame.event.post(pygame.event.Event(pygame.QUIT))
     with pytest.raises(Fault, match="closed before the last episode ended"):
         play_composed(tmp_path)
-    assert not (tmp_path / "runs").exists()
+    assert not [*tmp_path.glob("runs/*")]
 
 
 def test_without_pygame_one_line_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

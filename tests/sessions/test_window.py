@@ -1,11 +1,13 @@
 """The window of a person who plays, on SDL's dummy screen."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from atlantis_exp.components import facts_of, game_of
+from atlantis_exp.faults import Fault
 from atlantis_exp.sessions.window import Window
 
 BLACK = np.zeros((210, 160, 3), np.uint8)
@@ -34,6 +36,21 @@ def test_a_key_pressed_between_two_steps_is_an_action_and_no_key_is_none(pygame:
         assert window.choose(BLACK) == action
         assert window.choose(BLACK) == 0
     window.close()
+
+
+def test_without_a_screen_nobody_plays(pygame: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("SDL_VIDEODRIVER")
+    monkeypatch.setattr(pygame.display, "get_driver", lambda: "offscreen")
+    with pytest.raises(Fault, match=r"^play needs a screen"):
+        Window("Atlantis", facts_of(game_of("Atlantis-v0")), 1_000, 1)
+    pygame.display.quit()
+
+
+@pytest.mark.usefixtures("pygame")
+def test_a_key_that_pygame_does_not_know_is_named() -> None:
+    game = replace(facts_of(game_of("Atlantis-v0")), keys=(("uparrow", "FIRE"),))
+    with pytest.raises(Fault, match=r"^play: pygame does not know all keys of atlantis: uparrow$"):
+        Window("Atlantis", game, 1_000, 1)
 
 
 def test_the_window_shows_the_whole_screen_upright_and_scaled(pygame: Any) -> None:
