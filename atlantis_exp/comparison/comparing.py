@@ -162,7 +162,7 @@ def worse_than_baseline(answers: Sequence[Answer], by: Sequence[str]) -> list[st
         f"{verdict.seeds} seeds each)"
         for each in answers
         for verdict in each.decision.verdicts
-        if each.family.plan.baseline is not None and COMMIT in each.family.name.split(",") and verdict.said == "worse"
+        if each.family.plan.baseline is not None and verdict.said == "worse"
         if others(each, verdict.group) == others(each, verdict.other)
     ]
 

@@ -71,7 +71,7 @@ def _check(family: Family, looks: Sequence[Look]) -> None:
         if len(sizes) != 1 or not size < look.size <= family.plan.looks[-1] or not np.isfinite(numbers).all():
             raise ValueError(f"its looks by {family.name} are at impossible numbers")
         if not np.isclose(spent, family.plan.spendable(look.size), rtol=1e-6):
-            raise ValueError(f"its looks by {family.name} spent what none does")
+            raise ValueError(f"its looks by {family.name} spent another error than the plan lets them")
         for verdict in look.verdicts:
             found = {"better": verdict.low > 0, "worse": verdict.high < 0, "equivalent": family.plan.delta is not None}
             is_so = found.get(verdict.said, verdict.low <= 0 <= verdict.high)

@@ -161,12 +161,13 @@ def play(
 
 @contextmanager
 def _held(folder: RunFolder) -> Iterator[None]:
-    """Hold a run's folder, which is gone again where nothing was recorded: no game is played that it could not keep."""
+    """Hold a run's folder: no game is played that it could not keep. A new one goes where nothing was recorded."""
+    is_new = not folder.path.exists()
     with folder.held():
         try:
             yield
         finally:
-            if not folder.has_started:
+            if is_new and not folder.has_started:
                 shutil.rmtree(folder.path)
 
 

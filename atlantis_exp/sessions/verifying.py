@@ -96,6 +96,7 @@ def start(command: Sequence[str], said: Path) -> Session:
         return subprocess.Popen(command, stdout=lines, stderr=errors, start_new_session=True)
 
 
+@terminable()
 def run_and_kill(start: Callable[[Path], Session], outputs: Path, runs: str, kills: int, seconds: float = 1.0) -> int:
     """Start sessions that write runs under `outputs` until one ends by itself; returns how many kills struck.
 
@@ -110,25 +111,24 @@ def run_and_kill(start: Callable[[Path], Session], outputs: Path, runs: str, kil
     """
     struck = 0
     outputs.mkdir(parents=True, exist_ok=True)
-    with terminable():
-        while True:
-            before = generations(outputs, runs)
-            session = start(outputs / _SAID)
-            try:
-                while struck < kills and session.poll() is None:
-                    time.sleep(0.01)
-                    if generations(outputs, runs) > before:
-                        time.sleep(random.random() * seconds)
-                        break
-                else:
-                    if session.wait():
-                        error = (outputs / _SAID).read_text().strip().splitlines()
-                        raise Fault(f"a session under {outputs} failed: {error[-1] if error else 'it said nothing'}")
-                    return struck
-            finally:  # also where a signal ends this process: the session, in a group of its own, has not heard it
-                with suppress(ProcessLookupError):  # it has just ended
-                    os.killpg(session.pid, signal.SIGKILL)
-            struck += session.wait() == -signal.SIGKILL
+    while True:
+        before = generations(outputs, runs)
+        session = start(outputs / _SAID)
+        try:
+            while struck < kills and session.poll() is None:
+                time.sleep(0.01)
+                if generations(outputs, runs) > before:
+                    time.sleep(random.random() * seconds)
+                    break
+            else:
+                if session.wait():
+                    error = (outputs / _SAID).read_text().strip().splitlines()
+                    raise Fault(f"a session under {outputs} failed: {error[-1] if error else 'it said nothing'}")
+                return struck
+        finally:  # also where a signal ends this process: the session, in a group of its own, has not heard it
+            with suppress(ProcessLookupError):  # it has just ended
+                os.killpg(session.pid, signal.SIGKILL)
+        struck += session.wait() == -signal.SIGKILL
 
 
 def fingerprints(config: Config, outputs: Path) -> dict[str, str]:

@@ -21,8 +21,9 @@ from atlantis_exp.commands.composing import checked
 from atlantis_exp.commands.play import PlayConfig
 from atlantis_exp.comparison.gather import gather
 from atlantis_exp.faults import Fault
+from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.sessions import evaluating
-from atlantis_exp.sessions.evaluating import play, play_baseline
+from atlantis_exp.sessions.evaluating import _held, play, play_baseline
 from atlantis_exp.sessions.reporting import report
 from atlantis_exp.sessions.window import Window
 
@@ -188,6 +189,18 @@ def test_closing_the_window_ends_the_run_and_records_nothing(pygame: Any, tmp_pa
     with pytest.raises(Fault, match="closed before the last episode ended"):
         play_composed(tmp_path)
     assert not [*tmp_path.glob("runs/*")]
+
+
+def test_a_folder_that_was_there_before_an_evaluation_that_fails_stays(tmp_path: Path) -> None:
+    for was_there in (True, False):
+        folder = RunFolder(tmp_path / str(was_there))
+        if was_there:
+            folder.path.mkdir()
+            (folder.path / "note.txt").write_text("mine")
+        with pytest.raises(Fault), _held(folder):
+            raise Fault("no game was played")
+    assert (tmp_path / "True" / "note.txt").read_text() == "mine"
+    assert not (tmp_path / "False").exists()
 
 
 def test_without_pygame_one_line_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
