@@ -269,7 +269,8 @@ def test_what_was_trained_is_evaluated_compared_and_reported(
 ) -> None:
     place = f"paths.outputs={tmp_path}"
     for seed in (0, 1):
-        assert command(*replaced(tiny_overrides, f"seed={seed}", "evaluation.every_steps=null", place)) == 0
+        options = (f"seed={seed}", "evaluation.every_steps=null", "tracking=mlflow", place)
+        assert command(*replaced(tiny_overrides, *options)) == 0
     first, second = sorted(path.name for path in (tmp_path / "runs").iterdir())
     assert [name[: len("cnn-uniform-s0")] for name in (first, second)] == ["cnn-uniform-s0", "cnn-uniform-s1"]
 
