@@ -185,7 +185,10 @@ class Source:
             line = getattr(error, "lineno", None) or 1
             reason = getattr(error, "msg", None) or str(error) or type(error).__name__
             raise ConfigError(f"{self.path}:{line}: {type(error).__name__}: {reason}") from None
-        return [*_Reader(self, tree).components()]
+        try:
+            return [*_Reader(self, tree).components()]
+        except RecursionError:
+            raise ConfigError(f"{self.path}:1: a class or a type in it is made of itself") from None
 
 
 def describe(name: str, version: str | None, sha256: str) -> str:
@@ -390,8 +393,9 @@ class _Reader:
                     for kind in kinds:
                         settings = tuple(self._settings(node, KINDS[kind]))
                         facts = self._facts(node, KINDS[kind].facts or {})
-                        if facts.get("head") == "quantile" and "quantiles" not in {each.name for each in settings}:
-                            raise self._error(node, 'head = "quantile" needs a setting quantiles, their number')
+                        types = {each.name: getattr(each.type, "__origin__", each.type) for each in settings}
+                        if facts.get("head") == "quantile" and types.get("quantiles") is not int:
+                            raise self._error(node, 'head = "quantile" needs a setting quantiles: int, their number')
                         if kind == "env":
                             self._check_game(node, settings, facts)
                         yield Component(kind, name, node.name, settings, facts, self._source, node.lineno)
@@ -473,9 +477,14 @@ class _Reader:
             yield self._setting(argument.arg, argument.annotation, default, argument)
 
     def _setting(self, name: str, annotation: ast.expr, default: ast.expr | None, node: ast.AST) -> Setting:
-        if not re.fullmatch(NAME, name) or name == "name":
-            raise self._error(node, f"{name}: a setting is of small letters, digits and underscores, and not 'name'")
-        return Setting(name, self._type(name, annotation), MISSING if default is None else self._value(name, default))
+        if not re.fullmatch(NAME, name) or name in _TAKEN:
+            taken = " or ".join(map(repr, _TAKEN))
+            raise self._error(node, f"{name}: a setting is of small letters, digits and underscores, and not {taken}")
+        try:
+            told = self._type(name, annotation)
+        except TypeError:  # Python's own, of Annotated[int] or None | None
+            raise self._no_type(name, annotation) from None
+        return Setting(name, told, MISSING if default is None else self._value(name, default))
 
     def _facts(self, node: ast.ClassDef, silent: Mapping[str, Any]) -> dict[str, Any]:
         facts = dict(silent)
@@ -527,7 +536,10 @@ class _Reader:
                     case "Annotated":
                         ranges = [self._range(name, part) for part in parts[1:]]
                         return Annotated[self._type(name, parts[0]), *ranges]
-        raise self._error(
+        raise self._no_type(name, node)
+
+    def _no_type(self, name: str, node: ast.expr) -> ConfigError:
+        return self._error(
             node,
             f"{name}: {ast.unparse(node)} is no type of a setting; write int, float, bool, str, Literal[...], "
             "tuple[...], one of them or None, or Annotated[int, Interval(ge=1, le=9)]",
@@ -545,6 +557,8 @@ class _Reader:
 
 
 _HEADS = ("plain", "quantile")
+_TAKEN = ("component", "defaults", "name", "own", "settings")
+"""What a config says of every component, which no setting may be called."""
 
 
 def _last(node: ast.expr) -> str:

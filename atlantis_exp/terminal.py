@@ -1,6 +1,7 @@
 """Texts on a terminal as they are, where a name with brackets is no markup; what is under way, and durations."""
 
 import shutil
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -27,6 +28,11 @@ def console(least: int | None = None) -> Console:
 def harmless(text: str) -> str:
     """A stored text without what a terminal would obey: its lines of printable characters."""
     return "".join(character for character in text if character == "\n" or character.isprintable())
+
+
+def warn(text: str) -> None:
+    """Print one line on stderr, without what a terminal would obey."""
+    print(f"atlantis_exp: {harmless(text)}".replace("\n", " "), file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -342,6 +342,20 @@ BROKEN = [  # what is in mynet.py instead of a part of it, the line that is to b
         "def __init__",
         r"width: 'a side of' is no type of a setting",
     ),
+    ("width: Width", "width: Annotated[int]", "def __init__", r"width: Annotated\[int\] is no type of a setting"),
+    (
+        "Width = Annotated[int, Interval(ge=1, le=64)]",
+        "Width = Width",
+        "\n",
+        r"a class or a type in it is made of itself",
+    ),
+    (
+        '@component("mynet", "model")\nclass MyNet(nn.Module)',
+        'class Other(MyNet): ...\n@component("mynet", "model")\nclass MyNet(Other)',
+        "\n",
+        r"a class or a type in it is made of itself",
+    ),
+    ("width: Width", "settings: Width", "def __init__", r"settings: a setting is of small .* and not 'component' or"),
     ("width: Width = 8", "width=8", "def __init__", r"width: has no type"),
     ("width: Width = 8", "width: Width = 4 + 4", "def __init__", r"width: its value should be a number"),
     (
@@ -376,6 +390,10 @@ def test_a_plugin_that_fails_is_one_line_with_its_file_and_line(
 def test_a_head_of_quantiles_needs_their_number(plugins: Path, said: Said) -> None:
     (plugins / "parts.py").write_text(OTHERS.replace("    caution:", "    head = 'quantile'\n    caution:"))
     assert re.search(r"/parts.py:\d+: head = .* needs a setting quantiles", said("plugins=./parts.py"))
+    (plugins / "parts.py").write_text(
+        OTHERS.replace("    caution:", "    head = 'quantile'\n    quantiles: str = 'x'\n    caution:")
+    )
+    assert re.search(r"/parts.py:\d+: head = .* needs a setting quantiles: int", said("plugins=./parts.py"))
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,11 @@ def test_a_stored_text_keeps_its_lines_and_loses_what_a_terminal_obeys() -> None
     assert terminal.harmless("a\x1b]52;c;cm0=\x07\r\x9b2J\u202eb\nmean ± é") == "a]52;c;cm0=2Jb\nmean ± é"
 
 
+def test_a_warning_is_one_line_whatever_is_in_it(capsys: pytest.CaptureFixture[str]) -> None:
+    terminal.warn("left out a\nb: \x1b[2J\udcff ±")
+    assert capsys.readouterr() == ("", "atlantis_exp: left out a b: [2J ±\n")
+
+
 @pytest.fixture
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(terminal, "_FIRST_SECONDS", 0.01)

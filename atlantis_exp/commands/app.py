@@ -106,7 +106,7 @@ class Verb(Generic[T]):
 
 def exit_with(error: Exception) -> NoReturn:
     """End the process with one line and the error's exit code: 2 for a user's mistake."""
-    print(f"atlantis_exp: {error}", file=sys.stderr)
+    terminal.warn(str(error))
     sys.exit(getattr(error, "exit_code", 1))
 
 

@@ -249,7 +249,10 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
             _check_keys(values, _keys(config_name, chosen), groups)
         try:
             composed = _composed(config_name, tuple(texts))
-        except (HydraException, ValueError):  # mostly no such key; to know them all takes as long as to compose
+        except (HydraException, ValueError) as error:  # mostly no such key; to know all takes as long as to compose
+            for text in chosen:
+                if overrides[text].is_add() and str(error).startswith(f"Multiple values for {_key(overrides[text])}."):
+                    raise ConfigError(f"{text}: the config chooses one already; write {text[1:]}") from None
             _check_keys(values, _keys(config_name, chosen), groups)
             raise
         if OmegaConf.select(composed, "plugins") and "plugins" not in {_key(each) for each in overrides.values()}:

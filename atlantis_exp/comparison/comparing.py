@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -80,7 +79,7 @@ def compare(
     with terminal.working(f"reading the runs under {outputs}"):
         gathered = gather(outputs, runs, at_epsilon, put_aside=COMMIT in question.by)
     for name, reason in gathered.skipped.items():
-        print(f"atlantis_exp: left out {name}: {reason}", file=sys.stderr)
+        terminal.warn(f"left out {name}: {reason}")
     trainings = select(gathered.trainings, where)
     if not trainings:
         none = f": none of {len(gathered.trainings)} has where={','.join(where)}" if gathered.trainings else ""

@@ -21,7 +21,17 @@ from uuid import uuid4
 from pydantic import ValidationError
 
 from atlantis_exp.faults import Fault
-from atlantis_exp.runs.files import SMALL, inside, no_link, open_file, read_file, read_object, schema_of, write_file
+from atlantis_exp.runs.files import (
+    SMALL,
+    inside,
+    make_folder,
+    no_link,
+    open_file,
+    read_file,
+    read_object,
+    schema_of,
+    write_file,
+)
 
 Status = Literal["SCHEDULED", "RUNNING", "FINISHED", "FAILED", "KILLED"]
 NOTE_LENGTH = 7_900  # characters; MLflow cuts a description at 8,000 without a word
@@ -182,7 +192,7 @@ class Journal:
     """
 
     def __init__(self, folder: Path, labels: Mapping[str, str] | None = None) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         self._folder = folder
         self._time = _now()  # ms, of the latest metrics
         self._offset = 0  # bytes that are durable and that the state speaks for
@@ -321,7 +331,7 @@ def adopt(folder: Path, parent: Path) -> None:
     Raises:
         JournalError: on a folder whose `commit.json` is damaged.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     commit = read_commit(folder) or _unborn()
     adopted = replace(commit, parent=os.path.relpath(parent, folder))
     if adopted != commit:
@@ -343,7 +353,7 @@ def restore(folder: Path, start: int, pieces: Iterable[bytes]) -> None:
 
     The caller holds the folder, and what is committed in it ends at `start` or before.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     with open(folder / "journal.jsonl", "ab", opener=no_link) as file:
         file.truncate(start)
         file.writelines(pieces)

@@ -9,7 +9,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from atlantis_exp.faults import Fault
-from atlantis_exp.runs.files import SMALL, no_link, open_file, read_file
+from atlantis_exp.runs.files import SMALL, make_folder, no_link, open_file, read_file
 
 _HOLDER = "holder.txt"  # not the lock itself, which is emptied by whoever asks for it
 _OF_OPTUNA = "trials.jsonl.lock"  # a link while a process writes
@@ -24,7 +24,7 @@ def held(folder: Path, name: str, seconds: float) -> Iterator[None]:
     """
     if (link := _link(folder)) is not None:
         raise Fault(f"{name}: {link} is a link, which is not written through; put what it leads to in its place")
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     try:
         lock = FileLock(folder / "lock").acquire(seconds)
     except Timeout:

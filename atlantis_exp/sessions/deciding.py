@@ -83,7 +83,7 @@ def decide(request: Request) -> None:
             journal.finish()
         except (SystemExit, KeyboardInterrupt) as ended:
             journal.status("KILLED")
-            print(f"atlantis_exp: the decision goes on with: {request.command}", file=sys.stderr)
+            terminal.warn(f"the decision goes on with: {request.command}")
             sys.exit(ended.code if isinstance(ended, SystemExit) else 130)
         except BaseException as error:
             is_late = isinstance(error, Fault) and error.exit_code == 124

@@ -8,7 +8,6 @@ which nobody holds, and goes on with whoever looks for work next: its run is fou
 import dataclasses
 import io
 import os
-import sys
 import time
 import traceback
 import warnings
@@ -104,7 +103,7 @@ def search(request: Request) -> None:
                     else:
                         time.sleep(_WAIT_SECONDS)  # for the trials of other processes, one of which may be killed
         except SystemExit:
-            print(f"atlantis_exp: {again}", file=sys.stderr)
+            terminal.warn(again)
             raise
         if not has_ended:
             stop.end(again)

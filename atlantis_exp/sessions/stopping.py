@@ -10,6 +10,7 @@ from math import inf
 from types import FrameType
 from typing import Any, NoReturn
 
+from atlantis_exp import terminal
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder
 
@@ -51,7 +52,7 @@ class StopRequest:
             raise Fault(f"the sweep has ended: {message}", exit_code=128 + signal.SIGTERM)
         if self.signal is None:
             raise Fault(f"budget.wall_clock: {message}", exit_code=124)  # as of timeout(1)
-        print(f"atlantis_exp: {signal.Signals(self.signal).name}: {message}", file=sys.stderr, flush=True)
+        terminal.warn(f"{signal.Signals(self.signal).name}: {message}")
         if self.signal == signal.SIGUSR2 and callable(handler := self._before[signal.SIGUSR2]):
             handler(self.signal, None)  # submitit's own requeues the job and exits
         sys.exit(128 + self.signal)

@@ -55,7 +55,7 @@ def sync(
             except Fault as fault:
                 if seconds is None:
                     raise
-                print(f"atlantis_exp: {fault}; looking again in {every}", file=sys.stderr, flush=True)
+                terminal.warn(f"{fault}; looking again in {every}")
             if seconds is None:
                 return
             is_first = False
@@ -71,7 +71,7 @@ def _tell(way: str, looks: Iterable[Look], is_first: bool) -> None:
         outcome, run, reason = (terminal.harmless(text).replace("\n", " ") for text in look)  # a server's among them
         counts[outcome] += 1
         if reason:
-            print(f"atlantis_exp: {run}: {outcome}: {reason}", file=sys.stderr, flush=True)
+            terminal.warn(f"{run}: {outcome}: {reason}")
         elif outcome in _CHANGES:
             print(f"  {outcome:12}{run}", flush=True)
     if is_first or any(outcome in counts for outcome in (*_CHANGES, "failed")):

@@ -1,7 +1,6 @@
 """Run folders and the store while a command works: mirrored as they grow, and what earlier commands left is sent."""
 
 import os
-import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -47,9 +46,7 @@ def publishing(
         with terminal.working("publishing to MLflow"):
             is_sent = publisher.drain(_DRAIN_SECONDS)
         if not is_sent:
-            print(
-                f"atlantis_exp: MLflow has not taken all of {folder.name} yet; the run's folder has it", file=sys.stderr
-            )
+            terminal.warn(f"MLflow has not taken all of {folder.name} yet; the run's folder has it")
 
 
 def catch_up(outputs: Path, server: str | None = None, continued: Path | None = None) -> None:
@@ -72,7 +69,7 @@ def catch_up(outputs: Path, server: str | None = None, continued: Path | None = 
             is_sent = folder.status == "RUNNING" or folder.path == continued
             store = None if is_sent else unfinished(folder.path, outputs)
         except (Fault, OSError, ValueError) as error:
-            print(f"atlantis_exp: {error}", file=sys.stderr)  # no reason to refuse a command for another run
+            terminal.warn(str(error))  # no reason to refuse a command for another run
             continue
         if store is None or store.address in unreachable:
             continue
@@ -83,10 +80,7 @@ def catch_up(outputs: Path, server: str | None = None, continued: Path | None = 
             if not Publisher(folder.path, store).drain(_DRAIN_SECONDS):
                 unreachable.add(store.address)
     for uri, runs in left.items():
-        print(
-            f"atlantis_exp: {uri} lacks parts of {runs} runs; {PROGRAM} sync {quote(f'to={uri}')} sends them",
-            file=sys.stderr,
-        )
+        terminal.warn(f"{uri} lacks parts of {runs} runs; {PROGRAM} sync {quote(f'to={uri}')} sends them")
 
 
 def _runs_here(folder: RunFolder) -> bool:

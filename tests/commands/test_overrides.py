@@ -195,6 +195,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("sämpler=uniform", "sämpler=uniform", "quotes"),
     ("seed=☃", "seed=☃", "quotes"),
     ("seed='☃'", "seed=", "valid integer"),
+    ("+experiment=fast", "+experiment=fast", "write experiment=fast"),
     # other verbs
     ("query model=cnn", "model=cnn", "no such key"),
     ("evaluate model=1", "model=1", "no such key"),

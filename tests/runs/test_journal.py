@@ -320,6 +320,7 @@ def test_bytes_are_on_disk_before_their_name_and_lines_before_their_commit(
     journal.state_dict()
     journal.commit()
     assert tape == [
+        "fsync .",
         "fsync artifacts/a.aside",
         "name artifacts/a",
         "fsync artifacts",

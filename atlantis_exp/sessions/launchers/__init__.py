@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, NamedTuple, NoReturn
 
+from atlantis_exp import terminal
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal
@@ -76,7 +77,7 @@ def committed_at_the_end(
         nonlocal exit_code
         exit_code = 128 + number
         signal.signal(number, signal.SIG_DFL)  # a second one ends the process at once
-        print(f"atlantis_exp: {signal.Signals(number).name}: the jobs commit and end", file=sys.stderr, flush=True)
+        terminal.warn(f"{signal.Signals(number).name}: the jobs commit and end")
         stop()
         sys.exit(exit_code)
 

@@ -6,10 +6,10 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from atlantis_exp import terminal
 from atlantis_exp.faults import Fault
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.launchers import as_one_line
-from atlantis_exp.terminal import PROGRAM
 
 _LOOK_SECONDS = 5.0  # between two questions to Slurm
 
@@ -37,7 +37,7 @@ def all_awaited() -> Iterator[None]:
         lines = str(error).splitlines()  # behind the first two comes all that the job has printed
         raise Fault(" ".join(lines[:2]) if type(error) is UncompletedJobError else lines[-1]) from error
     except (KeyboardInterrupt, SystemExit) as left:
-        print(f"atlantis_exp: the jobs go on; {PROGRAM} sync publishes what they do", file=sys.stderr)
+        terminal.warn(f"the jobs go on; {terminal.PROGRAM} sync publishes what they do")
         sys.exit(getattr(left, "code", 128 + signal.SIGINT))
 
 
