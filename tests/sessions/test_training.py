@@ -252,8 +252,12 @@ def test_a_session_does_not_outlive_the_one_who_would_kill_it(
         return 0
 
     monkeypatch.setattr(verifying, "generations", generations)
-    with pytest.raises(end):
-        run_and_kill(start_one, tmp_path, "*", 1)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in what a shell runs in the background
+    try:
+        with pytest.raises(end):
+            run_and_kill(start_one, tmp_path, "*", 1)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert sessions[0].wait() == -signal.SIGKILL
 
 
