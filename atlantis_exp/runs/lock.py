@@ -64,6 +64,6 @@ def is_held(folder: Path) -> bool:
 @contextmanager
 def alone(path: Path) -> Iterator[None]:
     """Wait for a lock file and keep all other processes out of the block."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     with FileLock(path):
         yield

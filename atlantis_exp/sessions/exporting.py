@@ -10,6 +10,7 @@ from atlantis_exp import terminal
 from atlantis_exp.build import build_evaluator
 from atlantis_exp.checking import check_new
 from atlantis_exp.config import EvaluationConfig, PathsConfig
+from atlantis_exp.runs.files import make_folder
 from atlantis_exp.runs.folder import RunFolder, find_run
 from atlantis_exp.runs.journal import Metrics, Tags
 from atlantis_exp.sessions.cards import Card, build_exported_actor, pack, portable, write_card
@@ -49,7 +50,7 @@ def export(
     if onnx:
         with terminal.working("writing the network as ONNX, and asking both about the same states"):
             exported = export_onnx(trained, packed)
-    folder.mkdir(parents=True, exist_ok=True)  # before the episodes, lest there be no place for their scores
+    make_folder(folder)  # before the episodes, lest there be no place for their scores
     settings = replace(evaluation, video=False, num_envs=evaluation.at_once)
     progress = Progress()
     progress.say(f"{source.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")

@@ -116,7 +116,6 @@ def _open(request: Request) -> "_Session":
     facts = {"space": dict(request.texts), "training": config.science(), "budget.steps": config.budget.steps}
     name = request.name or f"search-{digest(facts)}"
     folder = RunFolder(Path(config.paths.outputs) / "searches" / name)
-    folder.path.mkdir(parents=True, exist_ok=True)
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     with alone(folder.path / "alone.lock"):
         if folder.has_started and folder.config != facts:

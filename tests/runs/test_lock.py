@@ -5,8 +5,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -136,6 +136,26 @@ def test_a_run_folder_names_itself(tmp_path: Path) -> None:
     assert not folder.is_held
     with folder.held():
         assert folder.is_held
+
+
+@pytest.mark.parametrize(
+    "hold",
+    [lambda path: held(path, "run x", 0.0), lambda path: alone(path / "by.lock")],
+    ids=["held", "alone"],
+)
+def test_the_names_of_folders_made_for_a_lock_are_on_disk(
+    hold: Callable[[Path], AbstractContextManager[None]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tape: list[str] = []
+    fsync = os.fsync
+
+    def taped_fsync(descriptor: int) -> None:
+        fsync(descriptor)
+        tape.append(os.path.relpath(os.readlink(f"/proc/self/fd/{descriptor}"), tmp_path))
+
+    monkeypatch.setattr(os, "fsync", taped_fsync)
+    with hold(tmp_path / "a" / "b"):
+        assert tape[:2] == [".", "a"]
 
 
 def test_those_who_want_to_be_alone_come_one_after_the_other(tmp_path: Path) -> None:

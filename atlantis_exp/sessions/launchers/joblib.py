@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 
 from atlantis_exp.faults import Fault
-from atlantis_exp.runs.files import no_link
+from atlantis_exp.runs.files import make_folder, no_link
 from atlantis_exp.runs.folder import OUTPUT, RunFolder
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
@@ -59,7 +59,7 @@ def train_apart(job: Job) -> None:
         return
     if not sweep_goes_on(folder, job.launcher)():
         raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
-    folder.path.mkdir(parents=True, exist_ok=True)
+    make_folder(folder.path)
     with open(folder.path / OUTPUT, "a+", opener=no_link) as output:
         start = output.tell()
         code = subprocess.run(

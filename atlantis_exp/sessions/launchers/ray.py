@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from typing import Any
 
-from atlantis_exp.runs.files import no_link
+from atlantis_exp.runs.files import make_folder, no_link
 from atlantis_exp.runs.folder import OUTPUT, RunFolder
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
@@ -41,7 +41,7 @@ def train_there(job: Job) -> None:
     from atlantis_exp.sessions.training import train  # and torch, which the sweep does without
 
     folder = RunFolder.of(job.config)
-    folder.path.mkdir(parents=True, exist_ok=True)
+    make_folder(folder.path)
     with (
         open(folder.path / OUTPUT, "a", buffering=1, opener=no_link) as output,
         redirect_stdout(output),
