@@ -458,5 +458,5 @@ def _in_training(views: Table) -> str:
             sides[view["leader"]].append(view["view"])
     if not any(sides.values()):
         return ""
-    leads = " and ".join(f"{label} leads at {', '.join(at)}" for label, at in sides.items() if at)
+    leads = "; ".join(f"{label} leads at {' and '.join(at)}" for label, at in sides.items() if at)
     return f"In training {leads}: a description, which nothing is decided by."

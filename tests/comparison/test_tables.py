@@ -173,7 +173,7 @@ def test_the_three_fair_views_stand_where_the_shortest_run_ends_and_may_disagree
     assert frames["leader_score"] == pytest.approx(2_000.5)  # half way
     assert (hours["at"], hours["leader"], hours["other_score"]) == (1.0, "cnn", pytest.approx(500.125))
     assert (flops["at"], flops["leader"], flops["other_score"]) == (1_000, "cnn", pytest.approx(4_001 * 1_000 / 20_000))
-    assert "resnet leads at equal frames and cnn leads at equal hours, equal gradient FLOPs" in comparison.notes[0]
+    assert "resnet leads at equal frames; cnn leads at equal hours and equal gradient FLOPs" in comparison.notes[0]
 
 
 def test_without_flops_that_view_alone_is_left_out_and_named(compared: Callable[..., Comparison]) -> None:
