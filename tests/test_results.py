@@ -46,24 +46,35 @@ def test_published_curves_are_quoted_as_they_are() -> None:
         assert f"{words} {means[name, 4e6]:,.0f} and {means[name, 5e6]:,.0f}" in text
 
 
-def test_a_run_that_is_kept_compares_as_it_did_and_names_no_place(
+def test_what_is_kept_compares_as_it_did_and_names_no_place(
     recorded: Callable[..., Path], command: Callable[..., int], tmp_path: Path
 ) -> None:
-    for seed in range(2):
-        recorded(f"seed={seed}", scores=(1_000.0 + seed, 3_000.0))
+    for seed in range(5):
+        for model, score in (("cnn", 1_000.0), ("resnet", 9_000.0)):
+            recorded(f"model={model}", f"seed={seed}", scores=(score + seed, score + 3 * seed))
     for run in all_runs(tmp_path):
         (run.path / "latest.safetensors").write_bytes(b"weights")
     (tmp_path / "runs" / "begun").mkdir()
+    (tmp_path / "comparisons" / "begun").mkdir(parents=True)
     kept = tmp_path / "kept"
-    runpy.run_path(str(DOCS / "keep_runs.py"))["main"](tmp_path, kept)
 
+    def compared(outputs: Path) -> tuple[dict[str, str], bytes]:
+        assert command("compare", "by=model", "tracking=none", f"paths.outputs={outputs}") == 0
+        (page,) = outputs.glob("comparisons/cnn-*")
+        tables = {path.name: path.read_text() for path in page.glob("artifacts/tables/*.csv")}
+        return tables, (page / "looks.json").read_bytes()
+
+    tables, looks = compared(tmp_path)
+    runpy.run_path(str(DOCS / "keep_runs.py"))["main"](tmp_path, kept)
+    (page,) = kept.glob("comparisons/*")
+    assert (page / "looks.json").read_bytes() == looks
+    assert len(tables["looks.csv"].splitlines()) == 2  # the first look, which is not taken again
+    assert len(tables) >= 10
     files = [path for path in kept.rglob("*") if path.is_file()]
-    assert {path.suffix for path in files} == {".json", ".jsonl", ".csv"}
+    assert {path.suffix for path in files} == {".json", ".jsonl", ".csv", ".html", ".png"}
     assert not [path for path in files if bytes(tmp_path) in path.read_bytes()]
-    tables = []
-    for outputs in (tmp_path, kept):
-        assert command("compare", "by=seed", "tracking=none", f"paths.outputs={outputs}") == 0
-        (page,) = outputs.glob("comparisons/*/artifacts")
-        tables.append({path.name: path.read_text() for path in page.glob("tables/*.csv") if path.stem != "skipped"})
-    assert tables[0] == tables[1]
-    assert len(tables[0]) >= 10
+
+    again, looks_again = compared(kept)
+    assert looks_again == looks
+    assert again.keys() == tables.keys()
+    assert [name for name in tables if tables[name] != again[name]] == ["skipped.csv"]

@@ -70,12 +70,16 @@ def modes_found(facts: Facts) -> Iterator[str]:
 
 
 def different_makers(facts: Facts) -> Iterator[str]:
-    """Precisions and devices, which do not enter a run's identity."""
-    for tag, called in (("precision", "precisions"), ("device", "devices")):
+    """Precisions, devices and processors, which do not enter a run's identity."""
+    for tag, how in (
+        ("precision", "in different precisions"),
+        ("device", "on different devices"),
+        ("processor", "on different processors, so that equal hours are not equal work"),
+    ):
         holders = _holders((run.tags[tag], run.name) for run in facts.trainings if tag in run.tags)
         if len(holders) > 1:
             named = "; ".join(f"{value}: {_listed(names)}" for value, names in sorted(holders.items()))
-            yield f"The runs were made in different {called}: {named}."
+            yield f"The runs were made {how}: {named}."
 
 
 def different_lengths(facts: Facts) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import platform
 import signal
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -157,10 +158,21 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
     facts = {
         "device": str(trainer.learner.device),
         "precision": str(trainer.learner.dtype).removeprefix("torch."),
+        "processor": _processor(trainer.learner.device),
         "threads": str(trainer.learner.shards * torch.get_num_threads()),
     }
     journal.tags({**provenance(job.command), **facts})
     journal.status("RUNNING")
+
+
+def _processor(device: torch.device) -> str:
+    """What a device computes on, as its maker calls it; a CPU with its instructions, on which the last bits depend."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    name = platform.processor() or platform.machine()  # Linux has no model in either
+    with suppress(OSError), open("/proc/cpuinfo") as lines:
+        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
+    return f"{name}, {torch.backends.cpu.get_cpu_capability()}"
 
 
 def _changed_plugins(config: Config, folder: RunFolder) -> str:

@@ -471,15 +471,16 @@ def test_seeds_that_fall_into_modes_come_with_survival_and_points_per_frame() ->
     assert "in the upper mode" in page(comparison, {}, {})
 
 
-def test_runs_of_different_precisions_or_devices_are_named() -> None:
+def test_runs_of_different_precisions_devices_or_processors_are_named() -> None:
     runs = [
-        *around("cnn", 3_000.0, tags={"precision": "bfloat16", "device": "cpu"}),
-        *around("resnet", 5_000.0, tags={"precision": "float32", "device": "cpu"}),
+        *around("cnn", 3_000.0, tags={"precision": "bfloat16", "device": "cpu", "processor": "Fast 2"}),
+        *around("resnet", 5_000.0, tags={"precision": "float32", "device": "cpu", "processor": "Slow 1"}),
     ]
     caveats = " ".join(compared(runs).caveats)
     assert "The runs were made in different precisions: bfloat16: cnn-uniform-s0, " in caveats
     assert "float32: resnet-uniform-s0" in caveats
     assert "devices" not in caveats
+    assert "on different processors, so that equal hours are not equal work: Fast 2: cnn-uniform-s0, " in caveats
 
 
 def test_runs_that_were_not_trained_equally_long_are_named_unless_that_is_the_question() -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from atlantis_exp.checking import parse, to_dict
 from atlantis_exp.commands.overrides import read_override
@@ -150,6 +151,19 @@ def test_scores_of_an_evaluation_before_the_last_step_are_said_to_be(
     assert "\nevaluated last at step 140 of 160 (evaluation.at_end=false):\n" in capsys.readouterr().out
     report(paths=config.paths)
     assert "160 (evaluated at 140)" in capsys.readouterr().out
+
+
+def test_a_run_says_what_it_was_made_on(tiny: Compose) -> None:
+    config = tiny(
+        "budget.steps=40", "training.precision=fp32", "evaluation.at_end=false", "evaluation.every_steps=null"
+    )
+    train(Job(config))
+    tags = read_facts(RunFolder.of(config).path).tags
+    assert (tags["device"], tags["precision"]) == ("cpu", "float32")
+    name, instructions = tags["processor"].rsplit(", ", 1)
+    assert name
+    assert ":" not in name
+    assert instructions == torch.backends.cpu.get_cpu_capability()
 
 
 @pytest.mark.slow
