@@ -1,8 +1,10 @@
 """The runs that docs/results.md answers from."""
 
 import csv
+import json
 import re
 import runpy
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -78,3 +80,38 @@ def test_what_is_kept_compares_as_it_did_and_names_no_place(
     assert looks_again == looks
     assert again.keys() == tables.keys()
     assert [name for name in tables if tables[name] != again[name]] == ["skipped.csv"]
+
+
+def test_the_verdict_is_said_as_the_kept_runs_say_it(
+    command: Callable[..., int], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (kept,) = DOCS.glob("verdict/comparisons/*")
+    for run in json.loads((kept / "config.json").read_bytes())["compared"]:
+        shutil.copytree(DOCS / "verdict" / "runs" / run, tmp_path / "runs" / run)
+    question = ("by=model", "where=training.precision=fp32", "tracking=none", f"paths.outputs={tmp_path}")
+    assert command("compare", *question) == 0
+    said = " ".join(capsys.readouterr().out.split())
+
+    def only(pattern: str) -> str:
+        (found,) = re.findall(pattern, said)
+        return str(found)
+
+    (made,) = tmp_path.glob("comparisons/*")
+    for name in ("verdict", "views", "runs"):
+        table = f"artifacts/tables/{name}.csv"
+        assert (made / table).read_text() == (kept / table).read_text()
+    readme, results = (" ".join((REPOSITORY / name).read_text().split()) for name in ("README.md", "docs/results.md"))
+    difference, interval = (
+        only(rf"Not decided: .* \(difference {part}, 5 seeds each") for part in (r"([\d,]+), .*", r".*, (-.*)")
+    )
+    for text in (readme, results):
+        assert "not decided" in text.lower()
+        assert f"{difference} points more" in text
+        assert interval in text
+    for pattern in (r"is \+([\d,]+) points: ", r"points: \+([\d,]+) by survival", r" and \+([\d,]+) by rate"):
+        assert only(pattern) in results
+    with (kept / "artifacts" / "tables" / "views.csv").open() as file:
+        views = {row["view"]: row for row in csv.DictReader(file)}
+    for view in ("equal frames", "equal gradient FLOPs"):
+        values = [f"{float(views[view][f'{key} (points)']):,.0f}" for key in ("difference", "low", "high")]
+        assert re.search(r"{} points[^.]* {} to {}\b".format(*values), results)
