@@ -1,4 +1,4 @@
-"""Copy finished runs and comparisons: what `compare` reads, and what it left.
+"""Copy finished runs, comparisons and decisions: what `compare` reads, and what it left.
 
 `python docs/keep_runs.py OUTPUTS TARGET`: `docs/verdict` and `docs/reproduction` are such targets. Weights, films, and
 the places of this machine are left out, and so are comparisons that nothing was looked at in.
@@ -26,10 +26,12 @@ def main(outputs: Path, target: Path) -> None:
         looks = path / "looks.json"
         if looks.exists() and any(json.loads(looks.read_bytes()).values()):
             keep(RunFolder(path), COMPARISON, target)
+    for path in sorted(outputs.glob("decisions/*/")):
+        keep(RunFolder(path), ("config.json",), target)  # which says the runs that its comparison is of
 
 
 def keep(run: RunFolder, names: Sequence[str], target: Path) -> None:
-    """Copy a run or a comparison, whose outputs folder is then called `outputs` and which belongs to no sweep."""
+    """Copy a folder of a run's form, whose outputs folder is then called `outputs` and which belongs to no sweep."""
     place = bytes(run.path.parents[1].absolute())
     target = target / run.path.parent.name / run.name
 

@@ -1,6 +1,6 @@
-"""Draw `docs/images/NAME.png` from `docs/data/NAME.csv`: scores of docs/results.md by steps and by hours.
+"""Draw `docs/images/fast.png` from `docs/data/fast.csv`: scores of docs/results.md by steps and by hours.
 
-`python docs/make_results_picture.py fast|answer [OUTPUTS...]`, from the root of the checkout. The trainings in the
+`python docs/make_results_picture.py [OUTPUTS...]`, from the root of the checkout. The trainings in the
 folders OUTPUTS enter the table first, in the place of what it has of runs of the same names.
 """
 
@@ -30,11 +30,11 @@ COLUMNS = ("run", "step", *KEYS, "evaluation")
 EVERY = 10_000  # steps between two rows of the table; evaluations have rows of their own
 
 
-def main(name: str, outputs: Sequence[Path]) -> None:
+def main(outputs: Sequence[Path]) -> None:
     """Bring the table up to date and draw a line a run, in its colour everywhere, with a point for each evaluation."""
     runs = [run for folder in outputs for run in all_runs(folder)]
     new = (dict(zip(COLUMNS, row, strict=True)) for run in runs for row in rows_of(run))
-    table = Path(f"docs/data/{name}.csv")
+    table = Path("docs/data/fast.csv")
     rows = updated(table, COLUMNS, {run.name for run in runs}, new, lambda row: (row["run"],))
 
     figure = Figure(figsize=(11, 4.5), dpi=100, layout="constrained")
@@ -54,7 +54,7 @@ def main(name: str, outputs: Sequence[Path]) -> None:
     thousands(by_steps.yaxis)
     by_steps.legend(frameon=False, fontsize="small")
     by_hours.set(xlabel="hours, whatever else the machine did")
-    figure.savefig(f"docs/images/{name}.png")
+    figure.savefig("docs/images/fast.png")
 
 
 def columns(rows: list[dict[str, str]], x: str, y: str, unit: float) -> tuple[list[float], list[float]]:
@@ -81,4 +81,4 @@ def rows_of(run: RunFolder) -> Iterator[list[str]]:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], [Path(argument) for argument in sys.argv[2:]])
+    main([Path(argument) for argument in sys.argv[1:]])

@@ -1,7 +1,6 @@
 """The runs that docs/results.md answers from."""
 
 import csv
-import json
 import re
 import runpy
 import shutil
@@ -18,6 +17,7 @@ from atlantis_exp.statistics import interquartile_mean
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
+RESULTS = DOCS / "results.md"
 KEPT = [(run, page) for page in ("verdict", "reproduction") for run in all_runs(DOCS / page)]
 PAGES = {"verdict": "results.md", "reproduction": "reproduction.md"}
 
@@ -38,7 +38,7 @@ def test_a_kept_run_is_still_the_run_of_its_config_and_in_the_table_of_its_page(
 
 
 def test_published_curves_are_quoted_as_they_are() -> None:
-    text = " ".join((DOCS / "results.md").read_text().split())
+    text = " ".join(RESULTS.read_text().split())
     means = {(row["name"], row["frames"]): row["mean"] for row in curves(game_of("Atlantis-v0"))}
     for name, words in (
         ("DreamerV3", "DreamerV3"),
@@ -85,22 +85,23 @@ def test_what_is_kept_compares_as_it_did_and_names_no_place(
 def test_the_verdict_is_said_as_the_kept_runs_say_it(
     command: Callable[..., int], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    (kept,) = DOCS.glob("verdict/comparisons/*")
-    for run in json.loads((kept / "config.json").read_bytes())["compared"]:
-        shutil.copytree(DOCS / "verdict" / "runs" / run, tmp_path / "runs" / run)
-    question = ("by=model", "where=training.precision=fp32", "tracking=none", f"paths.outputs={tmp_path}")
-    assert command("compare", *question) == 0
+    for name in ("runs", "decisions"):  # without the look, which is taken anew
+        shutil.copytree(DOCS / "verdict" / name, tmp_path / name)
+    (question,) = re.findall(r"^    python -m atlantis_exp (compare .*runs=.*)$", RESULTS.read_text(), re.MULTILINE)
+    assert command(*question.split(), "tracking=none", f"paths.outputs={tmp_path}") == 0
     said = " ".join(capsys.readouterr().out.split())
 
     def only(pattern: str) -> str:
         (found,) = re.findall(pattern, said)
         return str(found)
 
-    (made,) = tmp_path.glob("comparisons/*")
+    (made,), (kept,) = (place.glob("comparisons/*") for place in (tmp_path, DOCS / "verdict"))
+    assert made.name == kept.name
+    assert (made / "looks.json").read_text() == (kept / "looks.json").read_text()
     for name in ("verdict", "views", "runs"):
         table = f"artifacts/tables/{name}.csv"
         assert (made / table).read_text() == (kept / table).read_text()
-    readme, results = (" ".join((REPOSITORY / name).read_text().split()) for name in ("README.md", "docs/results.md"))
+    readme, results = (" ".join(page.read_text().split()) for page in (REPOSITORY / "README.md", RESULTS))
     difference, interval = (
         only(rf"Not decided: .* \(difference {part}, 5 seeds each") for part in (r"([\d,]+), .*", r".*, (-.*)")
     )
