@@ -22,12 +22,11 @@ def main(outputs: Path, target: Path) -> None:
     for run in all_runs(outputs):
         if run.result is not None:
             keep(run, RUN, target)
-    for path in sorted(outputs.glob("comparisons/*/")):
-        looks = path / "looks.json"
-        if looks.exists() and any(json.loads(looks.read_bytes()).values()):
-            keep(RunFolder(path), COMPARISON, target)
-    for path in sorted(outputs.glob("decisions/*/")):
-        keep(RunFolder(path), ("config.json",), target)  # which says the runs that its comparison is of
+    for looks in sorted(outputs.glob("comparisons/*/looks.json")):
+        if any(json.loads(looks.read_bytes()).values()):
+            keep(RunFolder(looks.parent), COMPARISON, target)
+    for config in sorted(outputs.glob("decisions/*/config.json")):  # the runs that its comparison is of
+        keep(RunFolder(config.parent), (config.name,), target)
 
 
 def keep(run: RunFolder, names: Sequence[str], target: Path) -> None:

@@ -232,7 +232,6 @@ class Store:
         # Whatever fails in MLflow reaches us as an exception; its log would add a traceback to each.
         logging.getLogger("mlflow").setLevel(logging.CRITICAL)
         logging.getLogger("alembic").setLevel(logging.WARNING)
-        self._root.mkdir(parents=True, exist_ok=True)
         with alone(self._root / "mlflow.lock"):  # processes that make the tables together break them for good
             if self.is_local:
                 database_file = self._root / DATABASE
