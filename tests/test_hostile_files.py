@@ -3,12 +3,13 @@
 import importlib
 import io
 import json
+import logging
 import os
 import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.faults import Fault
 from atlantis_exp.sessions.job import replaced
+from atlantis_exp.sessions.launchers import BASIC
 from atlantis_exp.training.checkpoint import _checksum
 
 pytestmark = pytest.mark.slow
@@ -37,8 +39,9 @@ VERBS = {
     "exported": ("evaluate", "weights={outputs}/card", "tracking=none", *PLAYING),
     "train": ("train",),  # a training that has ended
     "continue": ("train", "seed=1"),  # one that a larger budget continues
+    "sweep": ("train", "-m", "seed=0,1", "budget.steps=80"),  # of the two as they are
 }
-OF_A_RUN = ("compare", "report", "sync", "evaluate", "export", "best", "train")
+OF_A_RUN = ("compare", "report", "sync", "evaluate", "export", "best", "train", "sweep")
 READ_BY = {
     **{f"runs/*s0*/{name}": OF_A_RUN for name in ("config.json", "result.json", "commit.json", "journal.jsonl")},
     "runs/*s0*/artifacts/evaluation/000000160.csv": ("compare",),
@@ -58,6 +61,7 @@ READ_BY = {
     "evaluations/*/commit.json": ("compare", "sync"),
     "evaluations/*/artifacts/evaluation/episodes.csv": ("compare",),
     "comparisons/*/looks.json": ("compare",),
+    **{f"sweeps/*/{name}": ("sweep", "sync") for name in ("commit.json", "journal.jsonl", "published.json")},
     "card/card.json": ("exported",),
     "card/weights.safetensors": ("exported",),
 }
@@ -72,6 +76,7 @@ def run(*words: str) -> int:
     """A command line's exit code."""
     with pytest.MonkeyPatch.context() as patched, soon():
         patched.setattr(sys, "argv", ["atlantis_exp", *words])
+        patched.setattr(logging.root, "handlers", [])  # of another command, whose output is closed
         try:
             commands.main()
         except SystemExit as ended:
@@ -110,6 +115,7 @@ def sound(
     assert run("evaluate", "run=cnn-uniform-s0", "evaluation.seed=1", "tracking=none", *PLAYING, where) == 0
     assert run(*VERBS["compare"], where) == 0
     assert run("export", "run=cnn-uniform-s0", f"to={outputs}/card", *PLAYING, where) == 0
+    assert run(*words_of("sweep", training, outputs)) == 0
     return outputs, training
 
 
@@ -199,9 +205,17 @@ VALUES = st.recursive(
 
 def prepared(name: str, *words: str) -> Callable[[], object]:
     """A verb's work, composed and checked, to be done as often as one likes."""
-    asked: Verb[Any] = importlib.import_module(f"atlantis_exp.commands.{name}").VERB
-    ((overrides, config),) = check(asked.config_name or name, asked.schema, asked.rewrite(list(words))).items()
-    return asked.work(Asked(config, name, overrides, typed=words))
+    verb: Verb[Any] = importlib.import_module(f"atlantis_exp.commands.{name}").VERB
+    jobs = check(verb.config_name or name, verb.schema, verb.rewrite(list(words)))
+    asked = [Asked(config, name, overrides, typed=words) for overrides, config in jobs.items()]
+    works = [verb.work(each) for each in asked]
+
+    def work() -> None:
+        with verb.sweep(asked, BASIC, words) if len(asked) > 1 else nullcontext():
+            for each in works:
+                each()
+
+    return work
 
 
 @st.composite
@@ -307,7 +321,7 @@ def fuzzed(sound: tuple[Path, tuple[str, ...]], tmp_path_factory: pytest.TempPat
     whole, training = sound
     outputs = tmp_path_factory.mktemp("fuzzed") / "outputs"
     works = {verb: prepared(*words_of(verb, training, outputs)) for verb in VERBS}
-    places = ("runs", "evaluations", "comparisons", "card", "new")
+    places = ("runs", "evaluations", "comparisons", "sweeps", "card", "new")
 
     def call(pattern: str, verb: str, content: bytes, is_forged: bool) -> None:
         for place in places:

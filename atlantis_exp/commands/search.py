@@ -52,7 +52,7 @@ def _without_searched(arguments: list[str]) -> list[str]:
     """Leave out the keys that are given several values, which are those to search."""
     if {"-m", "--multirun"} & set(arguments):
         raise ConfigError("-m: a search is no sweep, it tries one set of values after the other; drop -m")
-    refuse_twice(arguments)
+    refuse_twice([argument.removeprefix("space.") for argument in arguments])
     searched = swept(arguments)
     return [argument for argument in arguments if argument not in searched]
 

@@ -81,6 +81,7 @@ def test_an_impossible_space_is_refused_in_one_line_before_anything_starts(
         ("trials=2", "nothing to search: give a key several values"),
         ("-m optimizer=adam,rmsprop", "-m: a search is no sweep"),
         ("optimizer=adam optimizer=adam,rmsprop", "optimizer=adam says something else"),
+        ("space.optimizer=adam,rmsprop optimizer=adam,adamw", "optimizer=adam,rmsprop says something else"),
         ("modle=cnn optimizer=adam,rmsprop", "did you mean 'model'?"),
         ("optimizer=adam,rmsprop evaluation.at_end=false", "evaluation.at_end=false: a search compares"),
         ("space=optimzer", "did you mean 'optimizer'?"),
