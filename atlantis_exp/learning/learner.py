@@ -241,7 +241,20 @@ class Learner(ActionValues):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where the learner stood that `state_dict` described."""
+        """Continue exactly where the learner stood that `state_dict` described.
+
+        Raises:
+            ValueError: where what the optimizer keeps of one parameter is not of the form of the others'.
+        """
+        parameters = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
+        forms = {
+            frozenset(
+                (name, getattr(value, "shape", None) == parameters[int(index)].shape) for name, value in kept.items()
+            )
+            for index, kept in state["optimizer"].items()
+        }
+        if len(forms) > 1:  # torch's load takes it, and the next update breaks off
+            raise ValueError("the optimizer's state does not fit its parameters")
         self.network.load_state_dict(state["network"])
         self.target.load_state_dict(state["target"])
         self.optimizer.load_state_dict(

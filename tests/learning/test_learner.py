@@ -615,6 +615,23 @@ def test_other_optimizers_continue_too(optimizer_class: type[torch.optim.Optimiz
     torch.testing.assert_close(unbroken.state_dict(), restored.state_dict(), rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("change", ["missing", "shape", "no tensor"])
+def test_an_optimizer_state_that_does_not_fit_is_refused(change: str) -> None:
+    learner = _learner(DQNCnn)
+    learner.update(*_batch(36))
+    state = _through_disk(learner.state_dict())
+    kept = state["optimizer"]["1"]
+    match change:
+        case "missing":
+            del kept["exp_avg"]
+        case "shape":
+            kept["exp_avg"] = kept["exp_avg"][1:]
+        case "no tensor":
+            kept["exp_avg"] = 1.0
+    with pytest.raises(ValueError, match="the optimizer's state does not fit its parameters"):
+        _learner(DQNCnn, seed=10).load_state_dict(state)
+
+
 def test_the_learning_rate_reaches_every_parameter_group() -> None:
     network, target = _networks(DQNCnn)
     groups = [{"params": [parameter]} for parameter in network.parameters()]
