@@ -247,11 +247,12 @@ class Learner(ActionValues):
             ValueError: where what the optimizer keeps of one parameter is not of the form of the others'.
         """
         parameters = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
+        kept = {int(index): values for index, values in state["optimizer"].items()}
         forms = {
             frozenset(
-                (name, getattr(value, "shape", None) == parameters[int(index)].shape) for name, value in kept.items()
+                (name, getattr(value, "shape", None) == parameters[index].shape) for name, value in values.items()
             )
-            for index, kept in state["optimizer"].items()
+            for index, values in kept.items()
         }
         if len(forms) > 1:  # torch's load takes it, and the next update breaks off
             raise ValueError("the optimizer's state does not fit its parameters")
@@ -259,8 +260,7 @@ class Learner(ActionValues):
         self.target.load_state_dict(state["target"])
         self.optimizer.load_state_dict(
             {
-                # copies, since the optimizer keeps what it is given
-                "state": {int(index): copy.deepcopy(values) for index, values in state["optimizer"].items()},
+                "state": copy.deepcopy(kept),  # since the optimizer keeps what it is given
                 "param_groups": self.optimizer.state_dict()["param_groups"],
             }
         )
