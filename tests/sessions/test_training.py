@@ -585,6 +585,7 @@ def test_a_server_that_is_gone_for_a_while_has_everything_once_it_is_back(
     with mlflow_server(server, port):
         training = session(config, tiny_overrides, *chosen)
         wait_for(lambda: published() > 0)
+    time.sleep(2.0)  # seconds; what the server answered at the end is noted in published.json by then
     before, evaluated = published(), evaluations()
     time.sleep(6.0)  # seconds; the publisher looks every 5
     wait_for(lambda: evaluations() >= evaluated + 3)
