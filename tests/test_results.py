@@ -12,6 +12,7 @@ import pytest
 
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.components import game_of
+from atlantis_exp.decision import mean_interval
 from atlantis_exp.runs.folder import RunFolder, all_runs, evaluation_at
 from atlantis_exp.statistics import interquartile_mean
 
@@ -35,6 +36,15 @@ def test_a_kept_run_is_still_the_run_of_its_config_and_in_the_table_of_its_page(
     assert len(scores) == 100
     row = rf"^\| {run.trained_config.seed} \|.* {scores.mean():,.0f} \({interquartile_mean(scores):,.0f}\) \|"
     assert re.search(row, (DOCS / PAGES[page]).read_text(), re.MULTILINE)
+
+
+def test_how_far_apart_the_seeds_of_the_reports_protocol_are_is_said_as_their_scores_say_it() -> None:
+    page = " ".join((DOCS / "reproduction.md").read_text().split())
+    scores = [run.result.evaluation["evaluation/mean"] for run, of in KEPT if of == "reproduction" and run.result]
+    low, high = mean_interval(scores)
+    assert f"the 95 % interval of their mean, {np.mean(scores):,.0f}, is {low:,.0f} to {high:,.0f}" in page
+    apart = f"{min(scores):,.0f} to {max(scores):,.0f}, with a standard deviation of {np.std(scores, ddof=1):,.0f}"
+    assert apart in page
 
 
 def test_published_curves_are_quoted_as_they_are() -> None:
