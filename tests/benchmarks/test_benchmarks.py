@@ -8,9 +8,22 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from benchmarks import emulation, evaluation, kills, learner, overhead, replay, startup, store, time_to_score, training
+from benchmarks import (
+    emulation,
+    evaluation,
+    kills,
+    learner,
+    overhead,
+    pace,
+    replay,
+    startup,
+    store,
+    time_to_score,
+    training,
+)
 from benchmarks.contest import paired_ratio, ratio, take_turns
 from benchmarks.time_to_score import Turn, hours_to, sooner
 
@@ -182,3 +195,21 @@ def test_the_time_to_score_trains_in_turns_and_plays_after_each(capsys: pytest.C
     first, second = results["curves"]["ours"]
     assert first[1] < second[1]
     assert results["hours"]["62500"]["ours"] is None
+
+
+def test_a_ship_is_seen_in_its_lane_and_a_shot_is_none() -> None:
+    screen = np.zeros((210, 160, 3), np.uint8)
+    screen[40:48, 70:78] = 90
+    for shot in ((20, 5), (24, 130), (62, 8)):
+        screen[shot] = 200
+    assert pace.ships(screen) == [False, True, False, False]
+    screen[:] = 128  # the flash of a loss
+    assert pace.ships(screen) == [False] * 4
+
+
+def test_the_pace_of_a_game_is_that_of_its_points(capsys: pytest.CaptureFixture[str]) -> None:
+    results = results_of(pace.main, "--steps 300 --epsilon 1", capsys)
+    assert 0 <= results["bonus_a_frame"] < results["points_a_frame"]
+    assert results["hits_a_thousand_frames"] > 0
+    assert results["share_of_steps_in_lane"][0] > results["share_of_steps_in_lane"][3]
+    assert 0 < results["share_of_steps_without_a_ship"] < 1
