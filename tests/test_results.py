@@ -19,23 +19,23 @@ from atlantis_exp.statistics import interquartile_mean
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
 RESULTS = DOCS / "results.md"
-KEPT = [(run, page) for page in ("verdict", "longer", "reproduction") for run in all_runs(DOCS / page)]
-PAGES = {"verdict": "results.md", "longer": "results.md", "reproduction": "reproduction.md"}
+PAGES = {"verdict": RESULTS, "longer": RESULTS, "rewards": RESULTS, "reproduction": DOCS / "reproduction.md"}
+KEPT = [(run, folder) for folder in PAGES for run in all_runs(DOCS / folder)]
 
 
 def test_there_are_kept_runs() -> None:
     assert KEPT
 
 
-@pytest.mark.parametrize(("run", "page"), KEPT, ids=lambda each: each if isinstance(each, str) else each.name)
-def test_a_kept_run_is_still_the_run_of_its_config_and_in_the_table_of_its_page(run: RunFolder, page: str) -> None:
+@pytest.mark.parametrize(("run", "folder"), KEPT, ids=lambda each: each if isinstance(each, str) else each.name)
+def test_a_kept_run_is_still_the_run_of_its_config_and_in_the_table_of_its_page(run: RunFolder, folder: str) -> None:
     assert run.trained_config.run_name() == run.name  # else `decide` would train it again
     assert run.result is not None
     with run.artifact(evaluation_at(run.result.steps)).open() as file:
         scores = np.array([float(episode["score"]) for episode in csv.DictReader(file)])
     assert len(scores) == 100
     row = rf"^\| {run.trained_config.seed} \|.* {scores.mean():,.0f} \({interquartile_mean(scores):,.0f}\) \|"
-    assert re.search(row, (DOCS / PAGES[page]).read_text(), re.MULTILINE)
+    assert re.search(row, PAGES[folder].read_text(), re.MULTILINE)
 
 
 def test_how_far_apart_the_seeds_of_the_reports_protocol_are_is_said_as_their_scores_say_it() -> None:
