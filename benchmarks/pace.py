@@ -9,6 +9,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +20,7 @@ from atlantis_exp.training.progress import Progress
 from benchmarks.contest import print_results
 from benchmarks.evaluation import player
 
-_PAID = {"centre_vessel": 100, "side_vessel": 200, "centre_bomber": 1_000, "side_bomber": 2_000}
+PAID = {"centre_vessel": 100, "side_vessel": 200, "centre_bomber": 1_000, "side_bomber": 2_000}
 _LANES = (19, 40, 61, 82)  # the first row of each
 _ROWS = 10  # of a ship
 _SHOTS = 5  # pixels; a shot is one, the smallest ship twelve
@@ -45,8 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     emulator = evaluator.make_emulator()
     seen = np.array([ships(moment.screen) for moment in moments(episode, emulator)])
     points = dict(zip(emulator.game.sources, episode.points, strict=True))
-    hits = sum(points[source] / paid for source, paid in _PAID.items())
-    results = {
+    hits = sum(points[source] / paid for source, paid in PAID.items())
+    results: dict[str, Any] = {
         "points_a_frame": episode.score / episode.frames,
         "bonus_a_frame": points["wave_bonus"] / episode.frames,
         "hits_a_thousand_frames": 1_000 * hits / episode.frames,
@@ -56,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"{args.weights} at epsilon {evaluator.epsilon:g}: {episode.steps:,} steps, {episode.frames:,} frames")
     print("{points_a_frame:.2f} points a frame, {bonus_a_frame:.2f} of them wave bonuses".format(**results))
     print("{hits_a_thousand_frames:.1f} hits a thousand frames".format(**results))
-    lanes = ", ".join(f"{share:.1%}" for share in seen.mean(axis=0))
+    lanes = ", ".join(f"{share:.1%}" for share in results["share_of_steps_in_lane"])
     print(f"a ship in the lanes, from the top: {lanes} of the steps")
     print("no ship at all: {share_of_steps_without_a_ship:.1%}".format(**results))
     print_results(results)

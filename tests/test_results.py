@@ -13,8 +13,10 @@ import pytest
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.components import game_of
 from atlantis_exp.decision import mean_interval
+from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.folder import RunFolder, all_runs, evaluation_at
 from atlantis_exp.statistics import interquartile_mean
+from benchmarks import pace
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
@@ -45,6 +47,47 @@ def test_how_far_apart_the_seeds_of_the_reports_protocol_are_is_said_as_their_sc
     assert f"the 95 % interval of their mean, {np.mean(scores):,.0f}, is {low:,.0f} to {high:,.0f}" in page
     apart = f"{min(scores):,.0f} to {max(scores):,.0f}, with a standard deviation of {np.std(scores, ddof=1):,.0f}"
     assert apart in page
+
+
+def evaluated(run: RunFolder) -> EpisodeTable:
+    """The evaluation at a kept run's end."""
+    assert run.result is not None
+    return EpisodeTable.read(run.artifact(evaluation_at(run.result.steps)), (*pace.PAID, "wave_bonus"))
+
+
+def test_survival_and_rate_of_the_longer_trainings_are_said_as_their_games_say_them() -> None:
+    longer = [run for run, folder in KEPT if folder == "longer"]
+    assert longer
+    for run in longer:
+        games = evaluated(run)
+        rate, capped = games.scores.sum() / games.frames.sum(), int(games.truncated.sum())
+        cells = f"| {capped} of 100 | {rate:.2f} | {games.scores.min():,.0f} | {games.scores.mean():,.0f} ("
+        assert cells in RESULTS.read_text()
+
+
+def pace_of(run: RunFolder) -> tuple[float, ...]:
+    """The columns of the table of rewards: three rates, points a hit, steps a game, points a game."""
+    games = evaluated(run)
+    *paid, bonus = games.points.sum(axis=0)
+    hits = dict(zip(pace.PAID, np.divide(paid, [*pace.PAID.values()]), strict=True))
+    every, score, frames = sum(hits.values()), games.scores.sum(), games.frames.sum()
+    by_side = 100 * (hits["side_vessel"] + hits["side_bomber"]) / every
+    rates = score / frames, 1_000 * every / frames, by_side
+    return (*rates, (score - bonus) / every, games.steps.mean(), games.scores.mean())
+
+
+def test_the_pace_of_trainings_with_other_rewards_is_said_as_their_games_say_it() -> None:
+    cells = "| {:.2f} | {:.1f} | {:.0f} % | {:.0f} | {:,.0f} | {:,.0f} ("
+    others = [run for run, folder in KEPT if folder == "rewards"]
+    assert others
+    for run in others:
+        assert cells.format(*pace_of(run)) in RESULTS.read_text()
+    configs = [(run, run.trained_config) for run, folder in KEPT if folder == "verdict"]
+    ten = [run for run, config in configs if config.model.name == "cnn" and config.training.precision == "fp32"]
+    assert len(ten) == 10
+    paces = np.array([pace_of(run) for run in ten])
+    ranges = "| {:.2f} to {:.2f} | {:.1f} to {:.1f} | {:.0f} to {:.0f} % | {:.0f} to {:.0f} | {:,.0f} to {:,.0f} |"
+    assert ranges.format(*np.stack((paces.min(axis=0), paces.max(axis=0)), axis=1)[:5].ravel()) in RESULTS.read_text()
 
 
 def test_published_curves_are_quoted_as_they_are() -> None:
