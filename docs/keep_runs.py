@@ -25,8 +25,8 @@ def main(outputs: Path, target: Path) -> None:
     for looks in sorted(outputs.glob("comparisons/*/looks.json")):
         if any(json.loads(looks.read_bytes()).values()):
             keep(RunFolder(looks.parent), COMPARISON, target)
-    for config in sorted(outputs.glob("decisions/*/config.json")):  # the runs that its comparison is of
-        keep(RunFolder(config.parent), (config.name,), target)
+    for journal in sorted(outputs.glob("decisions/*/journal.jsonl")):
+        keep(RunFolder(journal.parent), ("config.json",), target)  # which names the runs that its comparison is of
 
 
 def keep(run: RunFolder, names: Sequence[str], target: Path) -> None:

@@ -90,6 +90,23 @@ def test_the_pace_of_trainings_with_other_rewards_is_said_as_their_games_say_it(
     assert ranges.format(*np.stack((paces.min(axis=0), paces.max(axis=0)), axis=1)[:5].ravel()) in RESULTS.read_text()
 
 
+def test_what_top_half_scores_is_said_as_its_games_say_it() -> None:
+    means: dict[str, dict[int, float]] = {"uniform": {}, "top_half": {}}
+    for run in (run for run, folder in KEPT if folder == "verdict"):
+        config = run.trained_config
+        if config.model.name == "cnn" and config.training.precision == "fp32":
+            means[config.sampler.name][config.seed] = interquartile_mean(evaluated(run).scores)
+    top = [*means["top_half"].values()]
+    same, ten = [means["uniform"][seed] for seed in means["top_half"]], [*means["uniform"].values()]
+    assert top
+    assert len(ten) == 10
+    said = (
+        f"average {np.mean(top):,.0f} points, {min(top):,.0f} to {max(top):,.0f}; the same seeds of uniform "
+        f"sampling average {np.mean(same):,.0f}, and all its ten {np.mean(ten):,.0f}"
+    )
+    assert said in " ".join(RESULTS.read_text().split())
+
+
 def test_published_curves_are_quoted_as_they_are() -> None:
     text = " ".join(RESULTS.read_text().split())
     means = {(row["name"], row["frames"]): row["mean"] for row in curves(game_of("Atlantis-v0"))}
@@ -110,7 +127,9 @@ def test_what_is_kept_compares_as_it_did_and_names_no_place(
     for run in all_runs(tmp_path):
         (run.path / "latest.safetensors").write_bytes(b"weights")
     (tmp_path / "runs" / "begun").mkdir()
-    (tmp_path / "comparisons" / "begun").mkdir(parents=True)
+    for begun in ("comparisons", "decisions"):
+        (tmp_path / begun / "begun").mkdir(parents=True)
+    (tmp_path / "decisions" / "begun" / "config.json").write_text("{}")
     kept = tmp_path / "kept"
 
     def compared(outputs: Path) -> tuple[dict[str, str], bytes]:
