@@ -101,10 +101,13 @@ def test_what_top_half_scores_is_said_as_its_games_say_it() -> None:
     assert top
     assert len(ten) == 10
     said = (
-        f"average {np.mean(top):,.0f} points, {min(top):,.0f} to {max(top):,.0f}; the same seeds of uniform "
-        f"sampling average {np.mean(same):,.0f}, and all its ten {np.mean(ten):,.0f}"
+        f"average {np.mean(top):,.0f} points, {min(top):,.0f} to {max(top):,.0f}; the same seeds of uniform sampling "
+        f"average {np.mean(same):,.0f}, and all its ten {np.mean(ten):,.0f}"
     )
-    assert said in " ".join(RESULTS.read_text().split())
+    readme, results = (" ".join(page.read_text().split()) for page in (REPOSITORY / "README.md", RESULTS))
+    assert said in results
+    for text in (readme, results):
+        assert f"average {np.mean(top):,.0f} points with it and {np.mean(same):,.0f} without" in text
 
 
 def test_published_curves_are_quoted_as_they_are() -> None:
