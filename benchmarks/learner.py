@@ -84,12 +84,12 @@ def gemm_of(precision: str) -> Callable[[], None]:
 
 
 def chosen(names: Sequence[str] | None) -> list[Case]:
-    """The cases of these names; without any, all but those whose format this machine emulates."""
+    """The cases of these names; without any, all but those whose format is slower than float32 here."""
     if names is not None:
         return [case for case in CASES if case.name in names]
     if choose_precision("auto", choose_device("auto")) == "bf16":
         return [*CASES]
-    print("bfloat16 is emulated here: its cases are left out; --cases cnn_bf16 measures one", flush=True)
+    print("bfloat16 is slower than float32 here: its cases are left out; --cases cnn_bf16 measures one", flush=True)
     return [case for case in CASES if case.precision != "bf16"]
 
 

@@ -37,6 +37,24 @@ def test_the_operations_of_an_update_are_those_counted_by_hand(tiny: Callable[..
     assert 4 * 1.8e9 < counted("model=resnet", "env.size=159") < 4 * 1.9e9
 
 
+@pytest.mark.parametrize(
+    ("capabilities", "precision"),
+    [
+        ({"cpu_name": "Intel Xeon", "avx512_bf16": True, "amx_bf16": True}, "bf16"),
+        ({"cpu_name": "Intel Xeon", "avx512_bf16": True, "amx_bf16": False}, "fp32"),
+        ({"cpu_name": "AMD EPYC", "avx512_bf16": True, "amx_bf16": False}, "bf16"),
+        ({"cpu_name": "AMD EPYC", "avx512_bf16": False, "amx_bf16": False}, "fp32"),
+        ({"architecture": "arm64"}, "fp32"),
+    ],
+)
+def test_the_automatic_precision_is_the_faster_one(
+    capabilities: dict[str, object], precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
+    assert build.choose_precision("auto", torch.device("cpu")) == precision
+    assert build.choose_precision("bf16", torch.device("cpu")) == "bf16"
+
+
 @pytest.mark.parametrize(("capacity", "size"), [(120, 40), (70_000, 84)])
 def test_the_least_bytes_of_a_replay_memory_are_those_it_needs(
     tiny: Callable[..., Config], capacity: int, size: int

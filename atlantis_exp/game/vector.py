@@ -161,7 +161,7 @@ class ProcessEmulators(Emulators):
         context = multiprocessing.get_context("spawn")  # torch's threads make a fork unsafe
         memory = context.RawArray(c_ubyte, num_envs * row.itemsize)
         super().__init__(num_envs, first.game, np.frombuffer(memoryview(memory), row))
-        self._envs = _dealt(num_envs, workers)
+        self._envs = [range(worker, num_envs, workers) for worker in range(workers)]
         self._connections: list[Connection[Any, Any]] = []
         self._processes: list[multiprocessing.context.SpawnProcess] = []
         cores = _cores_for(workers)
@@ -209,13 +209,6 @@ def make_emulators(make: Callable[[], Emulator], num_envs: int, workers: int) ->
     if num_envs == 1 or workers == 0:
         return SerialEmulators(make, num_envs)
     return ProcessEmulators(make, num_envs, min(workers, num_envs))
-
-
-def _dealt(num_envs: int, workers: int) -> list[list[int]]:
-    """The environments of each worker, even ones first: an evaluation plays even and odd ones in turn, and all workers
-    are to have their share of either."""
-    envs = [*range(0, num_envs, 2), *range(1, num_envs, 2)]
-    return [envs[worker::workers] for worker in range(workers)]
 
 
 def _row(emulator: Emulator) -> np.dtype[np.void]:
