@@ -116,7 +116,7 @@ def choose_precision(name: str, device: torch.device) -> str:
     if device.type == "cuda":
         return "bf16" if torch.cuda.is_bf16_supported() else "fp32"
     has = torch.cpu.get_capabilities()
-    # Intel's AVX-512 multiplies bf16 half as fast as fp32 (docs/performance.md), its AMX many times as fast.
+    # Intel's AVX-512 multiplies bf16 half as fast as fp32 (docs/performance.md), its AMX faster.
     is_faster = has.get("amx_bf16") or (has.get("avx512_bf16") and "Intel" not in has.get("cpu_name", ""))
     return "bf16" if is_faster else "fp32"
 

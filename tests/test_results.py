@@ -25,6 +25,19 @@ PAGES = {"verdict": RESULTS, "longer": RESULTS, "rewards": RESULTS, "reproductio
 KEPT = [(run, folder) for folder in PAGES for run in all_runs(DOCS / folder)]
 
 
+def evaluated(run: RunFolder) -> EpisodeTable:
+    """The evaluation at a kept run's end."""
+    assert run.result is not None
+    return EpisodeTable.read(run.artifact(evaluation_at(run.result.steps)), (*pace.PAID, "wave_bonus"))
+
+
+def of_the_verdict(sampler: str) -> dict[int, RunFolder]:
+    """The trainings of DQNCnn in float32 with a sampler, by seed."""
+    runs = [run for run, folder in KEPT if folder == "verdict" and run.name.startswith(f"cnn-{sampler}-")]
+    configs = [(run, run.trained_config) for run in runs]
+    return {config.seed: run for run, config in configs if config.training.precision == "fp32"}
+
+
 def test_there_are_kept_runs() -> None:
     assert KEPT
 
@@ -32,9 +45,7 @@ def test_there_are_kept_runs() -> None:
 @pytest.mark.parametrize(("run", "folder"), KEPT, ids=lambda each: each if isinstance(each, str) else each.name)
 def test_a_kept_run_is_still_the_run_of_its_config_and_in_the_table_of_its_page(run: RunFolder, folder: str) -> None:
     assert run.trained_config.run_name() == run.name  # else `decide` would train it again
-    assert run.result is not None
-    with run.artifact(evaluation_at(run.result.steps)).open() as file:
-        scores = np.array([float(episode["score"]) for episode in csv.DictReader(file)])
+    scores = evaluated(run).scores
     assert len(scores) == 100
     row = rf"^\| {run.trained_config.seed} \|.* {scores.mean():,.0f} \({interquartile_mean(scores):,.0f}\) \|"
     assert re.search(row, PAGES[folder].read_text(), re.MULTILINE)
@@ -47,12 +58,6 @@ def test_how_far_apart_the_seeds_of_the_reports_protocol_are_is_said_as_their_sc
     assert f"the 95 % interval of their mean, {np.mean(scores):,.0f}, is {low:,.0f} to {high:,.0f}" in page
     apart = f"{min(scores):,.0f} to {max(scores):,.0f}, with a standard deviation of {np.std(scores, ddof=1):,.0f}"
     assert apart in page
-
-
-def evaluated(run: RunFolder) -> EpisodeTable:
-    """The evaluation at a kept run's end."""
-    assert run.result is not None
-    return EpisodeTable.read(run.artifact(evaluation_at(run.result.steps)), (*pace.PAID, "wave_bonus"))
 
 
 def test_survival_and_rate_of_the_longer_trainings_are_said_as_their_games_say_them() -> None:
@@ -82,22 +87,19 @@ def test_the_pace_of_trainings_with_other_rewards_is_said_as_their_games_say_it(
     assert others
     for run in others:
         assert cells.format(*pace_of(run)) in RESULTS.read_text()
-    uniform = [run for run, folder in KEPT if folder == "verdict" and run.name.startswith("cnn-uniform-")]
-    ten = [run for run in uniform if run.trained_config.training.precision == "fp32"]
+    ten = of_the_verdict("uniform")
     assert len(ten) == 10
-    paces = np.array([pace_of(run) for run in ten])
+    paces = np.array([pace_of(run) for run in ten.values()])
     ranges = "| {:.2f} to {:.2f} | {:.1f} to {:.1f} | {:.0f} to {:.0f} % | {:.0f} to {:.0f} | {:,.0f} to {:,.0f} |"
     assert ranges.format(*np.stack((paces.min(axis=0), paces.max(axis=0)), axis=1)[:5].ravel()) in RESULTS.read_text()
 
 
 def test_what_top_half_scores_is_said_as_its_games_say_it() -> None:
-    means: dict[str, dict[int, float]] = {"uniform": {}, "top_half": {}}
-    for run in (run for run, folder in KEPT if folder == "verdict"):
-        config = run.trained_config
-        if config.model.name == "cnn" and config.training.precision == "fp32":
-            means[config.sampler.name][config.seed] = interquartile_mean(evaluated(run).scores)
-    top = [*means["top_half"].values()]
-    same, ten = [means["uniform"][seed] for seed in means["top_half"]], [*means["uniform"].values()]
+    uniform, top_half = (
+        {seed: interquartile_mean(evaluated(run).scores) for seed, run in of_the_verdict(sampler).items()}
+        for sampler in ("uniform", "top_half")
+    )
+    top, same, ten = [*top_half.values()], [uniform[seed] for seed in top_half], [*uniform.values()]
     assert top
     assert len(ten) == 10
     said = (
