@@ -159,28 +159,41 @@ def test_what_is_kept_compares_as_it_did_and_names_no_place(
     assert [name for name in tables if tables[name] != again[name]] == ["skipped.csv"]
 
 
-def test_the_verdict_is_said_as_the_kept_runs_say_it(
+@pytest.fixture
+def asked_again(
     command: Callable[..., int], capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    (question,) = re.findall(r"^    python -m atlantis_exp (compare .*runs=.*)$", RESULTS.read_text(), re.MULTILINE)
-    shutil.copytree(DOCS / "verdict" / "decisions", tmp_path / "decisions")
-    for seeds in ("01234", "56789"):  # each look is taken anew, the first before the later seeds are there
-        for run in (DOCS / "verdict" / "runs").glob(f"*-s[{seeds}]-*"):
-            shutil.copytree(run, tmp_path / "runs" / run.name)
-        capsys.readouterr()
-        assert command(*question.split(), "tracking=none", f"paths.outputs={tmp_path}") == 0
-    said = " ".join(capsys.readouterr().out.split())
+) -> Callable[..., tuple[str, Path]]:
+    """Take the looks of a question of the page anew, over the kept runs of so many seeds each, against what is kept."""
+
+    def asked_again(by: str, *looks: str) -> tuple[str, Path]:
+        (question,) = re.findall(
+            rf"^    python -m atlantis_exp (compare by={by} .*)$", RESULTS.read_text(), re.MULTILINE
+        )
+        shutil.copytree(DOCS / "verdict" / "decisions", tmp_path / "decisions")
+        for seeds in looks:  # the first before the later seeds are there
+            for run in (DOCS / "verdict" / "runs").glob(f"*-s[{seeds}]-*"):
+                shutil.copytree(run, tmp_path / "runs" / run.name)
+            capsys.readouterr()
+            assert command(*question.split(), "tracking=none", f"paths.outputs={tmp_path}") == 0
+        said = " ".join(capsys.readouterr().out.split())
+        (made,) = tmp_path.glob("comparisons/*")
+        kept = DOCS / "verdict" / "comparisons" / made.name
+        assert (made / "looks.json").read_text() == (kept / "looks.json").read_text()
+        for name in ("verdict", "views", "runs"):
+            table = f"artifacts/tables/{name}.csv"
+            assert (made / table).read_text() == (kept / table).read_text()
+        return said, kept
+
+    return asked_again
+
+
+def test_the_verdict_is_said_as_the_kept_runs_say_it(asked_again: Callable[..., tuple[str, Path]]) -> None:
+    said, kept = asked_again("model", "01234", "56789")
 
     def only(pattern: str) -> str:
         (found,) = re.findall(pattern, said)
         return str(found)
 
-    (made,) = tmp_path.glob("comparisons/*")
-    kept = DOCS / "verdict" / "comparisons" / made.name
-    assert (made / "looks.json").read_text() == (kept / "looks.json").read_text()
-    for name in ("verdict", "views", "runs"):
-        table = f"artifacts/tables/{name}.csv"
-        assert (made / table).read_text() == (kept / table).read_text()
     readme, results = (" ".join(page.read_text().split()) for page in (REPOSITORY / "README.md", RESULTS))
     difference, interval = (
         only(rf"cnn plays better than resnet_fast by {part}, 10 seeds each\)")
@@ -196,3 +209,14 @@ def test_the_verdict_is_said_as_the_kept_runs_say_it(
     for view in ("equal frames", "equal gradient FLOPs"):
         values = [f"{float(views[view][f'{key} (points)']):,.0f}" for key in ("difference", "low", "high")]
         assert re.search(r"{} points[^.]* {} to {}\b".format(*values), results)
+
+
+def test_the_first_look_at_top_half_sampling_is_said_as_the_kept_runs_say_it(
+    asked_again: Callable[..., tuple[str, Path]],
+) -> None:
+    said, _ = asked_again("sampler", "0123456789")
+    found = re.search(r"Not decided: top_half against uniform \(difference (-([\d,]+)), (.*), 5 seeds each\)", said)
+    assert found
+    readme, results = (" ".join(page.read_text().split()) for page in (REPOSITORY / "README.md", RESULTS))
+    assert f"a difference of {found[1]} points ({found[3]})" in readme
+    assert f"top-half sampling has {found[2]} points less, {found[3]}." in results
