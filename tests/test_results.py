@@ -21,7 +21,9 @@ from benchmarks import pace
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
 RESULTS = DOCS / "results.md"
-PAGES = {"verdict": RESULTS, "longer": RESULTS, "rewards": RESULTS, "reproduction": DOCS / "reproduction.md"}
+PAGES = dict.fromkeys(("verdict", "longer", "rewards", "standard"), RESULTS) | {
+    "reproduction": DOCS / "reproduction.md"
+}
 KEPT = [(run, folder) for folder in PAGES for run in all_runs(DOCS / folder)]
 
 
@@ -36,6 +38,13 @@ def of_the_verdict(sampler: str) -> dict[int, RunFolder]:
     runs = [run for run, folder in KEPT if folder == "verdict" and run.name.startswith(f"cnn-{sampler}-")]
     configs = [(run, run.trained_config) for run in runs]
     return {config.seed: run for run, config in configs if config.training.precision == "fp32"}
+
+
+def training_at(run: RunFolder, step: int) -> tuple[float, float]:
+    """The hours until a step and the mean of 20 there, as the page's picture has them."""
+    with (DOCS / "data" / "standard.csv").open() as file:
+        row = next(row for row in csv.DictReader(file) if row["run"] == run.name and int(row["step"]) == step)
+    return float(row["hours"]), float(row["mean_20"])
 
 
 def test_there_are_kept_runs() -> None:
@@ -61,8 +70,8 @@ def test_how_far_apart_the_seeds_of_the_reports_protocol_are_is_said_as_their_sc
 
 
 def test_survival_and_rate_of_the_longer_trainings_are_said_as_their_games_say_them() -> None:
-    longer = [run for run, folder in KEPT if folder == "longer"]
-    assert longer
+    longer = [run for run, folder in KEPT if folder in {"longer", "standard"}]
+    assert {run.path.parents[1].name for run in longer} == {"longer", "standard"}
     for run in longer:
         games = evaluated(run)
         rate, capped = games.scores.sum() / games.frames.sum(), int(games.truncated.sum())
@@ -121,6 +130,21 @@ def test_published_curves_are_quoted_as_they_are() -> None:
         ("QR-DQN Nature CNN", "QR-DQN with the Nature network"),
     ):
         assert f"{words} {means[name, 4e6]:,.0f} and {means[name, 5e6]:,.0f}" in text
+
+
+def test_the_fields_game_is_set_against_the_published_curves_as_both_are() -> None:
+    means = {(row["name"], row["frames"]): row["mean"] for row in curves(game_of("Atlantis-v0"))}
+    (run,) = [run for run, folder in KEPT if folder == "standard"]
+    evaluated_at = {2: evaluation_at(500_000), 4: evaluation_at(1_000_000), 5: evaluation_at(1_250_000)}
+    for millions in range(2, 6):
+        hours, training = training_at(run, 250_000 * millions)
+        games = evaluated_at.get(millions)
+        evaluation = f"{EpisodeTable.read(run.artifact(games)).scores.mean():,.0f} " if games else ""
+        published = " | ".join(
+            f"{means[name, 1e6 * millions]:,.0f}" for name in ("DreamerV3", "QR-DQN Impala ResNet", "QR-DQN Nature CNN")
+        )
+        row = f"| {millions} | {hours:.2f} | {training:,.0f} | {evaluation}| {published} |"
+        assert row in RESULTS.read_text()
 
 
 def test_what_is_kept_compares_as_it_did_and_names_no_place(
