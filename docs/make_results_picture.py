@@ -32,10 +32,7 @@ EVERY = 10_000  # steps between two rows of the table; evaluations have rows of 
 
 def main(outputs: Sequence[Path]) -> None:
     """Bring the table up to date and draw a line a run, in its colour everywhere, with a point for each evaluation."""
-    runs = [run for folder in outputs for run in all_runs(folder)]
-    new = (dict(zip(COLUMNS, row, strict=True)) for run in runs for row in rows_of(run))
-    table = Path("docs/data/fast.csv")
-    rows = updated(table, COLUMNS, {run.name for run in runs}, new, lambda row: (row["run"],))
+    rows = rows_with(outputs, Path("docs/data/fast.csv"))
 
     figure = Figure(figsize=(11, 4.5), dpi=100, layout="constrained")
     by_steps, by_hours = figure.subplots(1, 2, sharey=True)
@@ -55,6 +52,13 @@ def main(outputs: Sequence[Path]) -> None:
     by_steps.legend(frameon=False, fontsize="small")
     by_hours.set(xlabel="hours, whatever else the machine did")
     figure.savefig("docs/images/fast.png")
+
+
+def rows_with(outputs: Sequence[Path], table: Path) -> list[dict[str, str]]:
+    """A table's rows, once the trainings in some outputs folders have entered it."""
+    runs = [run for folder in outputs for run in all_runs(folder)]
+    new = (dict(zip(COLUMNS, row, strict=True)) for run in runs for row in rows_of(run))
+    return updated(table, COLUMNS, {run.name for run in runs}, new, lambda row: (row["run"],))
 
 
 def columns(rows: list[dict[str, str]], x: str, y: str, unit: float) -> tuple[list[float], list[float]]:

@@ -9,15 +9,13 @@ from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 
-from make_results_picture import COLUMNS, columns, rows_of
+from make_results_picture import columns, rows_with
 from matplotlib.figure import Figure
-from tables import updated
 
 from atlantis_exp.comparison.figures import thousands
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.components import game_of
 from atlantis_exp.media import BLUE, GREY
-from atlantis_exp.runs.folder import all_runs
 
 PUBLISHED = {"DreamerV3": "s", "QR-DQN Impala ResNet": "^", "QR-DQN Nature CNN": "v"}
 FRAMES = 4  # a step
@@ -25,10 +23,7 @@ FRAMES = 4  # a step
 
 def main(outputs: Sequence[Path]) -> None:
     """Bring the table up to date and draw a line a training, with a point for each evaluation."""
-    runs = [run for folder in outputs for run in all_runs(folder)]
-    new = (dict(zip(COLUMNS, row, strict=True)) for run in runs for row in rows_of(run))
-    rows = updated(Path("docs/data/standard.csv"), COLUMNS, {run.name for run in runs}, new, lambda row: (row["run"],))
-
+    rows = rows_with(outputs, Path("docs/data/standard.csv"))
     figure = Figure(figsize=(7, 4.5), dpi=100, layout="constrained")
     axes = figure.subplots()
     for run, points in groupby(rows, key=lambda row: row["run"]):

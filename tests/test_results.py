@@ -15,6 +15,7 @@ from atlantis_exp.components import game_of
 from atlantis_exp.decision import mean_interval
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.folder import RunFolder, all_runs, evaluation_at
+from atlantis_exp.sessions.cards import read_card
 from atlantis_exp.statistics import interquartile_mean
 from benchmarks import pace
 
@@ -145,6 +146,15 @@ def test_the_fields_game_is_set_against_the_published_curves_as_both_are() -> No
         )
         row = f"| {millions} | {hours:.2f} | {training:,.0f} | {evaluation}| {published} |"
         assert row in RESULTS.read_text()
+
+
+def test_what_the_fields_game_scores_is_said_as_card_and_games_say_it() -> None:
+    card, _ = read_card(REPOSITORY / "pretrained" / "cnn_standard")
+    second = EpisodeTable.read(DOCS / "standard" / "seed_1.csv").scores
+    for page in (REPOSITORY / "README.md", RESULTS):
+        text = " ".join(page.read_text().split())
+        assert re.search(rf"scores \**{np.mean(card.scores):,.0f}\** ", text)
+        assert f"second training has {second.mean():,.0f} over {len(second)}" in text
 
 
 def test_what_is_kept_compares_as_it_did_and_names_no_place(
