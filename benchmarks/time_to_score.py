@@ -163,6 +163,13 @@ PROGRAMS: dict[str, Callable[[Judge], AbstractContextManager[Measure[Turn]]]] = 
 }
 
 
+def turn_of(name: str, contestant: Contestant[Turn], seconds: float) -> Turn:
+    """A turn of training; says what it led to, since hours of turns may be interrupted."""
+    turn = contestant.measure(seconds)
+    print(f"{name}: {turn.score:,.0f} after {turn.steps:,} steps, {turn.hours:.3f} h more", file=sys.stderr, flush=True)
+    return turn
+
+
 def hours_to(goal: float, turns: Sequence[Turn]) -> float:
     """The training after which a score was first reached, infinite where it was not."""
     hours = itertools.accumulate(turn.hours for turn in turns)
@@ -200,7 +207,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         contestants = {
             name: stack.enter_context(Contestant(functools.partial(PROGRAMS[name], judge))) for name in names
         }
-        calls = {name: functools.partial(one.measure, 60 * args.turn) for name, one in contestants.items()}
+        calls = {name: functools.partial(turn_of, name, one, 60 * args.turn) for name, one in contestants.items()}
         turns = take_turns(calls, rounds)
     print_table(
         f"mean of {args.episodes} games after hours of training; * cut after {args.cut:,} steps",

@@ -191,10 +191,14 @@ def test_the_time_to_a_score_is_that_of_the_first_turn_that_has_it() -> None:
 @pytest.mark.slow
 def test_the_time_to_score_trains_in_turns_and_plays_after_each(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = "--contestants ours --minutes 0.1 --turn 0.05 --episodes 2 --cut 40"
-    results = results_of(time_to_score.main, arguments, capsys)
+    time_to_score.main(arguments.split())
+    printed = capsys.readouterr()
+    results = json.loads(printed.out.splitlines()[-1])
     first, second = results["curves"]["ours"]
     assert first[1] < second[1]
     assert results["hours"]["62500"]["ours"] is None
+    for _, steps, score in (first, second):  # an interrupted run has said what its turns led to
+        assert f"ours: {score:,.0f} after {steps:,} steps" in printed.err
 
 
 def test_a_ship_is_seen_in_its_lane_and_a_shot_is_none() -> None:
