@@ -15,6 +15,7 @@ from atlantis_exp.components import game_of
 from atlantis_exp.decision import mean_interval
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.folder import RunFolder, all_runs, evaluation_at
+from atlantis_exp.runs.journal import Tags
 from atlantis_exp.sessions.cards import read_card
 from atlantis_exp.statistics import interquartile_mean
 from benchmarks import pace
@@ -102,6 +103,39 @@ def test_the_pace_of_trainings_with_other_rewards_is_said_as_their_games_say_it(
     paces = np.array([pace_of(run) for run in ten.values()])
     ranges = "| {:.2f} to {:.2f} | {:.1f} to {:.1f} | {:.0f} to {:.0f} % | {:.0f} to {:.0f} | {:,.0f} to {:,.0f} |"
     assert ranges.format(*np.stack((paces.min(axis=0), paces.max(axis=0)), axis=1)[:5].ravel()) in RESULTS.read_text()
+
+
+def test_the_three_networks_in_bfloat16_are_set_side_by_side_as_their_runs_are() -> None:
+    readme, results = (" ".join(page.read_text().split()) for page in (REPOSITORY / "README.md", RESULTS))
+    noop: dict[str, float] = {}
+    for name, network in (("cnn", "DQNCnn"), ("resnet_fast", "ResNetFast"), ("resnet", "ResNetDQN")):
+        (run,) = (
+            run
+            for run, folder in KEPT
+            if folder == "verdict"
+            and run.name.startswith(f"{name}-")
+            and run.trained_config.training.precision == "bf16"
+        )
+        assert run.result is not None
+        (flops,) = (
+            float(record.values["flops_per_update"])
+            for record in run.records()
+            if isinstance(record, Tags) and "flops_per_update" in record.values
+        )
+        counts, games = run.result.counts, evaluated(run)
+        teraflops = flops * counts["updates"] / 1e12
+        rate, mean = games.scores.sum() / games.frames.sum(), games.scores.mean()
+        cells = f"{counts['hours']:.2f} | {teraflops:,.0f} | {rate:.2f} | {games.steps.mean():,.0f}"
+        row = (
+            rf"\| {network} \| [12] \| {re.escape(cells)} \| {mean:,.0f} \({interquartile_mean(games.scores):,.0f}\) \|"
+        )
+        assert re.search(row, results)
+        assert f"{network} {mean:,.0f}" in readme
+        noop[network] = run.result.evaluation["actions/favourite_share"]
+    said = (
+        f"NOOP in {100 * noop['ResNetDQN']:.0f} % of the network's decisions, {100 * noop['DQNCnn']:.0f} % of DQNCnn's"
+    )
+    assert said in results
 
 
 def test_what_top_half_scores_is_said_as_its_games_say_it() -> None:
@@ -201,7 +235,7 @@ def asked_again(
 
     def asked_again(by: str, *looks: str) -> tuple[str, Path]:
         (question,) = re.findall(
-            rf"^    python -m atlantis_exp (compare by={by} .*)$", RESULTS.read_text(), re.MULTILINE
+            rf"^    python -m atlantis_exp (compare by={by} runs=decide-.*)$", RESULTS.read_text(), re.MULTILINE
         )
         shutil.copytree(DOCS / "verdict" / "decisions", tmp_path / "decisions")
         for seeds in looks:  # the first before the later seeds are there
