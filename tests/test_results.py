@@ -35,11 +35,11 @@ def evaluated(run: RunFolder) -> EpisodeTable:
     return EpisodeTable.read(run.artifact(evaluation_at(run.result.steps)), (*pace.PAID, "wave_bonus"))
 
 
-def of_the_verdict(sampler: str) -> dict[int, RunFolder]:
-    """The trainings of DQNCnn in float32 with a sampler, by seed."""
-    runs = [run for run, folder in KEPT if folder == "verdict" and run.name.startswith(f"cnn-{sampler}-")]
+def of_the_verdict(sampler: str, model: str = "cnn", precision: str = "fp32") -> dict[int, RunFolder]:
+    """A network's trainings with a sampler, by seed."""
+    runs = [run for run, folder in KEPT if folder == "verdict" and run.name.startswith(f"{model}-{sampler}-")]
     configs = [(run, run.trained_config) for run in runs]
-    return {config.seed: run for run, config in configs if config.training.precision == "fp32"}
+    return {config.seed: run for run, config in configs if config.training.precision == precision}
 
 
 def training_at(run: RunFolder, step: int) -> tuple[float, float]:
@@ -107,35 +107,32 @@ def test_the_pace_of_trainings_with_other_rewards_is_said_as_their_games_say_it(
 
 def test_the_three_networks_in_bfloat16_are_set_side_by_side_as_their_runs_are() -> None:
     readme, results = (" ".join(page.read_text().split()) for page in (REPOSITORY / "README.md", RESULTS))
+    teraflops: dict[str, float] = {}
     noop: dict[str, float] = {}
-    for name, network in (("cnn", "DQNCnn"), ("resnet_fast", "ResNetFast"), ("resnet", "ResNetDQN")):
-        (run,) = (
-            run
-            for run, folder in KEPT
-            if folder == "verdict"
-            and run.name.startswith(f"{name}-")
-            and run.trained_config.training.precision == "bf16"
-        )
+    for model, network in (("cnn", "DQNCnn"), ("resnet_fast", "ResNetFast"), ("resnet", "ResNetDQN")):
+        run = of_the_verdict("uniform", model, "bf16")[0]
         assert run.result is not None
-        (flops,) = (
-            float(record.values["flops_per_update"])
-            for record in run.records()
-            if isinstance(record, Tags) and "flops_per_update" in record.values
-        )
+        tags = [record.values for record in run.records() if isinstance(record, Tags)]
+        (flops,) = (float(values["flops_per_update"]) for values in tags if "flops_per_update" in values)
         counts, games = run.result.counts, evaluated(run)
-        teraflops = flops * counts["updates"] / 1e12
+        teraflops[network] = flops * counts["updates"] / 1e12
+        noop[network] = 100 * run.result.evaluation["actions/favourite_share"]
         rate, mean = games.scores.sum() / games.frames.sum(), games.scores.mean()
-        cells = f"{counts['hours']:.2f} | {teraflops:,.0f} | {rate:.2f} | {games.steps.mean():,.0f}"
-        row = (
-            rf"\| {network} \| [12] \| {re.escape(cells)} \| {mean:,.0f} \({interquartile_mean(games.scores):,.0f}\) \|"
-        )
-        assert re.search(row, results)
+        config = run.trained_config
+        assert (
+            f"| {network} | {config.threads} | {counts['hours']:.2f} | {teraflops[network]:,.0f} | {rate:.2f} | "
+            f"{games.steps.mean():,.0f} | {mean:,.0f} ({interquartile_mean(games.scores):,.0f}) |"
+        ) in results
         assert f"{network} {mean:,.0f}" in readme
-        noop[network] = run.result.evaluation["actions/favourite_share"]
-    said = (
-        f"NOOP in {100 * noop['ResNetDQN']:.0f} % of the network's decisions, {100 * noop['DQNCnn']:.0f} % of DQNCnn's"
+    assert f"but from {games.scores.min():,.0f} to {games.scores.max():,.0f} points" in results  # ResNetDQN's
+    assert f"ResNetDQN scores {mean:,.0f} by the recipe" in results
+    assert (
+        f"NOOP in {noop['ResNetDQN']:.0f} % of the network's decisions, {noop['DQNCnn']:.0f} % of DQNCnn's" in results
     )
-    assert said in results
+    more = f"{teraflops['ResNetDQN'] / teraflops['DQNCnn']:.1f} times the arithmetic of DQNCnn"
+    assert more in readme
+    assert results.count(more) == 2
+    assert f"a sample takes {flops / config.training.batch_size / 1e9:.2f} GFLOP of an update" in results
 
 
 def test_what_top_half_scores_is_said_as_its_games_say_it() -> None:
