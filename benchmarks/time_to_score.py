@@ -3,9 +3,9 @@
 `experiment=fast` with DQNCnn, sb3-contrib's QR-DQN with RL Zoo's settings for Atari, and Stable-Baselines3's DQN with
 those of CleanRL's `dqn_atari.py` (whose loss is squared, not Huber's). Each is a process of its own that has all cores
 in its turn and rests while the others have theirs, as in `benchmarks.training`; after each turn its network plays a few
-games, at one epsilon for all and on the clock of none. Ours trains and plays in the report's game (two to four frames a
-step, sticky actions), the peers in theirs, `AtlantisNoFrameskip-v4` with SB3's `AtariWrapper` (four frames a step, no
-sticky actions). Until the last turn games are cut after --cut steps, so that scores above are at least as shown.
+games, at one epsilon for all and on the clock of none. All train and play in the game that the peers' settings are made
+for, `AtlantisNoFrameskip-v4`: four frames a step, up to 30 no-ops first, no sticky actions. Until the last turn games
+are cut after --cut steps, so that scores above are at least as shown.
 """
 
 import argparse
@@ -33,6 +33,7 @@ from atlantis_exp.training.progress import Progress
 from benchmarks.composition import composed
 from benchmarks.contest import Contestant, Measure, missing, print_results, print_table, take_turns
 
+GAME = ("env=atlantis_standard", "env.sticky=0", "env.noop_max=30")  # AtlantisNoFrameskip-v4 in SB3's AtariWrapper
 GOALS = (25_240, 62_500)  # the report's best mean, and its best game
 
 _ACTIONS = 4
@@ -70,7 +71,7 @@ class Judge:
 def ours(judge: Judge) -> Iterator[Measure[Turn]]:
     """Our recipe."""
     quiet = ("evaluation.at_end=false", "evaluation.every_steps=null", "evaluation.video=false")
-    config = composed("experiment=fast", *quiet)
+    config = composed("experiment=fast", *GAME, *quiet)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         trainer = build_trainer(config, Path(folder), NullJournal(), _QUIET)
         stack.callback(trainer.emulators.close)
@@ -94,7 +95,7 @@ def stable_baselines3(judge: Judge, make: Callable[[Any], Any]) -> Iterator[Meas
 
     env = VecFrameStack(make_atari_env("AtlantisNoFrameskip-v4", seed=0), 4)
     model = make(env)
-    config = composed("env=atlantis_standard", "env.sticky=0", "env.noop_max=30")  # as AtariWrapper plays
+    config = composed(*GAME)
 
     network = model.quantile_net if hasattr(model, "quantile_net") else model.q_net
 

@@ -18,6 +18,7 @@ from atlantis_exp.components import game_of
 from atlantis_exp.media import BLUE, GREY
 
 PUBLISHED = {"DreamerV3": "s", "QR-DQN Impala ResNet": "^", "QR-DQN Nature CNN": "v"}
+SEEDS = (("-", "o"), ("--", "X"), (":", "D"))  # line of training, mark of evaluations
 FRAMES = 4  # a step
 
 
@@ -27,11 +28,12 @@ def main(outputs: Sequence[Path]) -> None:
     figure = Figure(figsize=(7, 4.5), dpi=100, layout="constrained")
     axes = figure.subplots()
     for run, points in groupby(rows, key=lambda row: row["run"]):
-        training, seed = list(points), run.split("-")[2].removeprefix("s")
+        training, seed = list(points), int(run.split("-")[2].removeprefix("s"))
         evaluated = [row for row in training if row["evaluation"]]
-        style = {"color": BLUE, "linestyle": "--" if int(seed) else "-"}
-        axes.plot(*columns(training, "step", "mean_20", 1e6 / FRAMES), linewidth=1, label=f"seed {seed}", **style)
-        axes.plot(*columns(evaluated, "step", "evaluation", 1e6 / FRAMES), "o", color=BLUE)
+        line, mark = SEEDS[seed]
+        axes.plot(*columns(training, "step", "mean_20", 1e6 / FRAMES), color=BLUE, linestyle=line, linewidth=1)
+        axes.plot(*columns(evaluated, "step", "evaluation", 1e6 / FRAMES), mark, color=BLUE)
+        axes.plot([], [], color=BLUE, linestyle=line, marker=mark, linewidth=1, label=f"seed {seed}")
     last = max(FRAMES * int(row["step"]) for row in rows) / 1e6
     for name, mark in PUBLISHED.items():
         known = [row for row in curves(game_of("Atlantis-v0")) if row["name"] == name]

@@ -26,13 +26,14 @@ RESULTS = DOCS / "results.md"
 PAGES = dict.fromkeys(("verdict", "longer", "rewards", "standard"), RESULTS) | {
     "reproduction": DOCS / "reproduction.md"
 }
+SOURCES = (*pace.PAID, "wave_bonus")  # of points
 KEPT = [(run, folder) for folder in PAGES for run in all_runs(DOCS / folder)]
 
 
 def evaluated(run: RunFolder) -> EpisodeTable:
     """The evaluation at a kept run's end."""
     assert run.result is not None
-    return EpisodeTable.read(run.artifact(evaluation_at(run.result.steps)), (*pace.PAID, "wave_bonus"))
+    return EpisodeTable.read(run.artifact(evaluation_at(run.result.steps)), SOURCES)
 
 
 def of_the_verdict(sampler: str, model: str = "cnn", precision: str = "fp32") -> dict[int, RunFolder]:
@@ -74,22 +75,43 @@ def test_how_far_apart_the_seeds_of_the_reports_protocol_are_is_said_as_their_sc
 def test_survival_and_rate_of_the_longer_trainings_are_said_as_their_games_say_them() -> None:
     longer = [run for run, folder in KEPT if folder in {"longer", "standard"}]
     assert {run.path.parents[1].name for run in longer} == {"longer", "standard"}
-    for games in (*map(evaluated, longer), EpisodeTable.read(DOCS / "standard" / "seed_1.csv")):
+    for games in (*map(evaluated, longer), seed_1_of_the_fields_game()):
         rate, capped = games.scores.sum() / games.frames.sum(), int(games.truncated.sum())
         mean = f"{games.scores.mean():,.0f} ({interquartile_mean(games.scores):,.0f})"
         cells = f"| {capped} of {len(games.scores)} | {rate:.2f} | {games.scores.min():,.0f} | {mean} |"
         assert cells in RESULTS.read_text()
 
 
+def seed_1_of_the_fields_game() -> EpisodeTable:
+    """The games of the training whose folder is not kept."""
+    return EpisodeTable.read(DOCS / "standard" / "seed_1.csv", SOURCES)
+
+
+def hits_of(games: EpisodeTable) -> tuple[dict[str, float], float]:
+    """How often each source of points was hit, and what a hit pays on average."""
+    *paid, _ = points = games.points.sum(axis=0)
+    hits = dict(zip(pace.PAID, np.divide(paid, [*pace.PAID.values()]), strict=True))
+    return hits, points[:-1].sum() / sum(hits.values())
+
+
 def pace_of(run: RunFolder) -> tuple[float, ...]:
     """The columns of the table of rewards: three rates, points a hit, steps a game, points a game."""
     games = evaluated(run)
-    *paid, bonus = games.points.sum(axis=0)
-    hits = dict(zip(pace.PAID, np.divide(paid, [*pace.PAID.values()]), strict=True))
-    every, score, frames = sum(hits.values()), games.scores.sum(), games.frames.sum()
+    hits, paid = hits_of(games)
+    every, frames = sum(hits.values()), games.frames.sum()
     by_side = 100 * (hits["side_vessel"] + hits["side_bomber"]) / every
-    rates = score / frames, 1_000 * every / frames, by_side
-    return (*rates, (score - bonus) / every, games.steps.mean(), games.scores.mean())
+    rates = games.scores.sum() / frames, 1_000 * every / frames, by_side
+    return (*rates, paid, games.steps.mean(), games.scores.mean())
+
+
+def test_by_which_guns_seeds_of_the_fields_game_differ_is_said_as_their_games_say_it() -> None:
+    games = {run.trained_config.seed: evaluated(run) for run, folder in KEPT if folder == "standard"}
+    assert games.keys() == {0, 2}
+    for seed, played in (games | {1: seed_1_of_the_fields_game()}).items():
+        hits, paid = hits_of(played)
+        frames, bombers = played.frames.sum() / 1_000, hits["centre_bomber"] + hits["side_bomber"]
+        cells = f"{sum(hits.values()) / frames:.1f} | {bombers / frames:.1f} | {hits['side_bomber'] / bombers:.0%}"
+        assert f"| {seed} | {cells.replace('%', ' %')} | {paid:.0f} |" in RESULTS.read_text()
 
 
 def test_the_pace_of_trainings_with_other_rewards_is_said_as_their_games_say_it() -> None:
@@ -166,7 +188,7 @@ def test_published_curves_are_quoted_as_they_are() -> None:
 
 def test_the_fields_game_is_set_against_the_published_curves_as_both_are() -> None:
     means = {(row["name"], row["frames"]): row["mean"] for row in curves(game_of("Atlantis-v0"))}
-    (run,) = [run for run, folder in KEPT if folder == "standard"]
+    (run,) = [run for run, folder in KEPT if folder == "standard" and run.trained_config.seed == 0]
     evaluated_at = {2: evaluation_at(500_000), 4: evaluation_at(1_000_000), 5: evaluation_at(1_250_000)}
     for millions in range(2, 6):
         hours, training = training_at(run, 250_000 * millions)
@@ -181,11 +203,14 @@ def test_the_fields_game_is_set_against_the_published_curves_as_both_are() -> No
 
 def test_what_the_fields_game_scores_is_said_as_card_and_games_say_it() -> None:
     card, _ = read_card(REPOSITORY / "pretrained" / "cnn_standard")
-    second = EpisodeTable.read(DOCS / "standard" / "seed_1.csv").scores
+    second = seed_1_of_the_fields_game().scores
+    (third,) = [run for run, folder in KEPT if folder == "standard" and run.trained_config.seed == 2]
     for page in (REPOSITORY / "README.md", RESULTS):
         text = " ".join(page.read_text().split())
         assert re.search(rf"scores \**{np.mean(card.scores):,.0f}\** ", text)
         assert f"second training has {second.mean():,.0f} over {len(second)}" in text
+        assert f"{evaluated(third).scores.mean():,.0f}" in text
+        assert f"after {60 * training_at(third, 1_250_000)[0]:.0f} minutes" in text
 
 
 def test_what_is_kept_compares_as_it_did_and_names_no_place(

@@ -169,6 +169,6 @@ def _line(snapshot: Snapshot) -> str:
 
 
 def _time_left(snapshot: Snapshot) -> str:
-    if snapshot.steps_left is None or snapshot.steps_per_second <= 0:
-        return "?"
+    if snapshot.steps_left is None or snapshot.steps_per_second <= 0 or not snapshot.updates:
+        return "?"  # without updates steps go many times as fast
     return terminal.clock(snapshot.steps_left / snapshot.steps_per_second)

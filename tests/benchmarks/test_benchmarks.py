@@ -4,6 +4,7 @@ import itertools
 import json
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from benchmarks import (
     time_to_score,
     training,
 )
+from benchmarks.composition import composed
 from benchmarks.contest import paired_ratio, ratio, take_turns
 from benchmarks.time_to_score import Turn, hours_to, sooner
 
@@ -186,6 +188,12 @@ def test_the_time_to_a_score_is_that_of_the_first_turn_that_has_it() -> None:
     assert sooner(201, turns) == (12.0, True)  # the longest that a peer tried
     assert sooner(301, turns) is None
     assert sooner(100, {"ours": turns["ours"]}) is None
+
+
+def test_ours_trains_in_the_game_of_the_peers() -> None:
+    ours, theirs = (composed(*recipe, *time_to_score.GAME).env for recipe in (("experiment=fast",), ()))
+    assert (theirs.frameskip, theirs.sticky, theirs.noop_max, theirs.max_steps) == (4, 0, 30, None)
+    assert replace(ours, crop=theirs.crop, num_envs=theirs.num_envs) == theirs
 
 
 @pytest.mark.slow

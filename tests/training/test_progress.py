@@ -115,6 +115,10 @@ def test_the_time_left_follows_from_the_pace(steps_left: float | None, steps_per
     assert line.endswith(f"  left {left}\n")
 
 
+def test_before_the_first_update_the_pace_says_nothing_of_the_time_left() -> None:
+    assert line_of(replace(SNAPSHOT, updates=0)).endswith("  left ?\n")
+
+
 @pytest.mark.parametrize(("terminal", "seconds", "at_once"), [(False, 4.0, False), (True, 0.25, True)])
 def test_a_training_is_shown_a_few_times_a_second_on_a_terminal_and_now_and_then_elsewhere(
     clock: Clock, monkeypatch: pytest.MonkeyPatch, terminal: bool, seconds: float, at_once: bool
