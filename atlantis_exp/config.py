@@ -145,7 +145,8 @@ class ObjectiveConfig(ComponentConfig):
     gamma: Annotated[float, Field(ge=0, lt=1)]
     n_step: Annotated[int, Field(ge=1, le=1_000)]  # rewards before the bootstrap
     reward_scale: Positive
-    reward_clip: Positive | None  # after scaling; null: not clipped
+    reward_exponent: Annotated[float, Field(gt=0, le=1)] = 1.0  # of what is scaled
+    reward_clip: Positive | None  # after both; null: not clipped
     terminal_on_life_loss: bool
     target: TargetConfig
 
@@ -481,6 +482,8 @@ class Config:
         for key in ("ema", "weights"):
             if tree["training"][key] is None:  # a run from before there was the key stays itself
                 del tree["training"][key]
+        if tree["objective"]["reward_exponent"] == 1:
+            del tree["objective"]["reward_exponent"]
         if not self.plugins:
             del tree["plugins"]
         # A list, since the order of phases counts and their names do not.

@@ -103,6 +103,7 @@ def another(key: str, value: Any) -> Any:
         "model.head": ("plain", "dueling"),
         "objective.target.mode": ("eval", "train"),
         "objective.target.start": ("copy", "independent"),
+        "objective.reward_exponent": (0.5, 0.25),
         "optimizer.name": ("adam", "adamw"),
         "training.precision": ("fp32", "bf16"),
         "training.ema": (100, 200),

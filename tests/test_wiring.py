@@ -32,8 +32,8 @@ from atlantis_exp.training.trainer import Trainer
 Command = Callable[..., int]
 Started = Callable[[Config, Path], Trainer]
 
-RETURNS = "Returns(gamma=0.99, n_step=1, scale=1.0, clip=None)"
-FURTHER_RETURNS = "Returns(gamma=0.997, n_step=5, scale=1.0, clip=None)"
+RETURNS = "Returns(gamma=0.99, n_step=1, scale=1.0, exponent=1.0, clip=None)"
+FURTHER_RETURNS = "Returns(gamma=0.997, n_step=5, scale=1.0, exponent=1.0, clip=None)"
 ADAM = {"lr": 1e-3, "betas": (0.9, 0.999), "eps": 1e-8, "fused": True}
 RMSPROP = {"centered": True, "weight_decay": 0, "foreach": True}
 TARGET = {"tau": 1e-4, "target_every": 1, "target_mode": "eval"}

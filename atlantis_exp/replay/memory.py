@@ -24,20 +24,24 @@ _SEGMENT_DTYPES = _ENTRY_DTYPES | {"data": np.uint8, "dictionary": np.uint8, "en
 class Returns:
     """What a transition is worth: up to `n_step` rewards, then the value of the state after them.
 
-    The memory keeps the game's rewards; the learner's are those times `scale`, then clipped to -`clip`..`clip`. They
-    are summed with discount `gamma` a step. Where an episode ends or has come no further yet, the rewards are fewer
-    and what follows is discounted less; after a terminal step nothing follows.
+    The memory keeps the game's rewards; the learner's are those times `scale`, their size then to the power of
+    `exponent`, then clipped to -`clip`..`clip`. They are summed with discount `gamma` a step. Where an episode ends or
+    has come no further yet, the rewards are fewer and what follows is discounted less; after a terminal step nothing
+    follows.
     """
 
     gamma: float
     n_step: int = 1  # steps
     scale: float = 1.0
+    exponent: float = 1.0
     clip: float | None = None  # None: not clipped
 
     def reward(self, r_t: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
         """Return the learner's rewards for the game's."""
-        scaled = self.scale * r_t.astype(np.float64)
-        return scaled if self.clip is None else scaled.clip(-self.clip, self.clip)
+        reward = self.scale * r_t.astype(np.float64)
+        if self.exponent != 1:
+            reward = np.sign(reward) * np.abs(reward) ** self.exponent
+        return reward if self.clip is None else reward.clip(-self.clip, self.clip)
 
 
 class Transitions(NamedTuple):

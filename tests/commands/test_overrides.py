@@ -99,6 +99,8 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("epsilon.start=1.5", "epsilon.start=1.5", "less than or equal to 1"),
     ("objective.gamma=1", "objective.gamma=1", "less than 1"),
     ("objective.n_step=0", "objective.n_step=0", "greater than or equal to 1"),
+    ("objective.reward_exponent=0", "objective.reward_exponent=0", "greater than 0"),
+    ("objective.reward_exponent=1.5", "objective.reward_exponent=1.5", "less than or equal to 1"),
     ("objective.reward_clip=0", "objective.reward_clip=0", "greater than 0"),
     ("objective.target.every=0", "objective.target.every=0", "greater than or equal to 1"),
     ("objective.quantiles=51", "objective.quantiles", "no such key"),
