@@ -1,6 +1,7 @@
 """The runs that docs/results.md answers from."""
 
 import csv
+import itertools
 import re
 import runpy
 import shutil
@@ -15,7 +16,7 @@ from atlantis_exp.components import game_of
 from atlantis_exp.decision import mean_interval
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.folder import RunFolder, all_runs, evaluation_at
-from atlantis_exp.runs.journal import Tags
+from atlantis_exp.runs.journal import Metrics, Tags
 from atlantis_exp.sessions.cards import read_card
 from atlantis_exp.statistics import interquartile_mean
 from benchmarks import pace
@@ -27,6 +28,7 @@ PAGES = dict.fromkeys(("verdict", "longer", "rewards", "standard"), RESULTS) | {
     "reproduction": DOCS / "reproduction.md"
 }
 SOURCES = (*pace.PAID, "wave_bonus")  # of points
+GUNS_AND_SHIPS = tuple(itertools.product(("centre", "side"), ("vessel", "bomber")))
 KEPT = [(run, folder) for folder in PAGES for run in all_runs(DOCS / folder)]
 
 
@@ -41,6 +43,18 @@ def of_the_verdict(sampler: str, model: str = "cnn", precision: str = "fp32") ->
     runs = [run for run, folder in KEPT if folder == "verdict" and run.name.startswith(f"{model}-{sampler}-")]
     configs = [(run, run.trained_config) for run in runs]
     return {config.seed: run for run, config in configs if config.training.precision == precision}
+
+
+def of_the_fields_game() -> dict[int, RunFolder]:
+    """The kept trainings in the field's game, by seed."""
+    return {run.trained_config.seed: run for run, folder in KEPT if folder == "standard"}
+
+
+def games_of_the_fields_game() -> list[EpisodeTable]:
+    """The games of its three seeds; of the second no folder is kept."""
+    runs = of_the_fields_game()
+    assert runs.keys() == {0, 2}
+    return [evaluated(runs[0]), EpisodeTable.read(DOCS / "standard" / "seed_1.csv", SOURCES), evaluated(runs[2])]
 
 
 def training_at(run: RunFolder, step: int) -> tuple[float, float]:
@@ -73,25 +87,20 @@ def test_how_far_apart_the_seeds_of_the_reports_protocol_are_is_said_as_their_sc
 
 
 def test_survival_and_rate_of_the_longer_trainings_are_said_as_their_games_say_them() -> None:
-    longer = [run for run, folder in KEPT if folder in {"longer", "standard"}]
-    assert {run.path.parents[1].name for run in longer} == {"longer", "standard"}
-    for games in (*map(evaluated, longer), seed_1_of_the_fields_game()):
+    longer = [evaluated(run) for run, folder in KEPT if folder == "longer"]
+    assert longer
+    for games in (*longer, *games_of_the_fields_game()):
         rate, capped = games.scores.sum() / games.frames.sum(), int(games.truncated.sum())
         mean = f"{games.scores.mean():,.0f} ({interquartile_mean(games.scores):,.0f})"
         cells = f"| {capped} of {len(games.scores)} | {rate:.2f} | {games.scores.min():,.0f} | {mean} |"
         assert cells in RESULTS.read_text()
 
 
-def seed_1_of_the_fields_game() -> EpisodeTable:
-    """The games of the training whose folder is not kept."""
-    return EpisodeTable.read(DOCS / "standard" / "seed_1.csv", SOURCES)
-
-
 def hits_of(games: EpisodeTable) -> tuple[dict[str, float], float]:
     """How often each source of points was hit, and what a hit pays on average."""
-    *paid, _ = points = games.points.sum(axis=0)
+    paid = games.points.sum(axis=0)[:-1]  # all but wave bonuses
     hits = dict(zip(pace.PAID, np.divide(paid, [*pace.PAID.values()]), strict=True))
-    return hits, points[:-1].sum() / sum(hits.values())
+    return hits, paid.sum() / sum(hits.values())
 
 
 def pace_of(games: EpisodeTable) -> tuple[float, ...]:
@@ -104,9 +113,7 @@ def pace_of(games: EpisodeTable) -> tuple[float, ...]:
 
 
 def test_by_which_guns_seeds_of_the_fields_game_differ_is_said_as_their_games_say_it() -> None:
-    games = {run.trained_config.seed: evaluated(run) for run, folder in KEPT if folder == "standard"}
-    assert games.keys() == {0, 2}
-    for seed, played in (games | {1: seed_1_of_the_fields_game()}).items():
+    for seed, played in enumerate(games_of_the_fields_game()):
         hits, paid = hits_of(played)
         frames, bombers = played.frames.sum() / 1_000, hits["centre_bomber"] + hits["side_bomber"]
         cells = f"{sum(hits.values()) / frames:.1f} | {bombers / frames:.1f} | {hits['side_bomber'] / bombers:.0%}"
@@ -120,23 +127,48 @@ def test_the_pace_of_trainings_with_other_rewards_is_said_as_their_games_say_it(
     for run in others:
         assert cells.format(*pace_of(evaluated(run))) in RESULTS.read_text()
     ten = [evaluated(run) for run in of_the_verdict("uniform").values()]
-    of_the_field = [evaluated(run) for run, folder in KEPT if folder == "standard"]
-    assert (len(ten), len(of_the_field)) == (10, 2)
+    assert len(ten) == 10
     ranges = "| {:.2f} to {:.2f} | {:.1f} to {:.1f} | {:.0f} to {:.0f} % | {:.0f} to {:.0f} | {:,.0f} to {:,.0f} |"
-    for clipped in (ten, [*of_the_field, seed_1_of_the_fields_game()]):
+    for clipped in (ten, games_of_the_fields_game()):
         paces = np.array([pace_of(games) for games in clipped])
         low_and_high = np.stack((paces.min(axis=0), paces.max(axis=0)), axis=1)
         row = ranges.format(*low_and_high[:5].ravel()).replace("27,000 to 27,000", "27,000")
         assert row in RESULTS.read_text()
-    (powered,) = [run for run in others if run.trained_config.objective.reward_exponent < 1]
-    hits, _ = hits_of(games := evaluated(powered))
+
+
+def test_what_rewards_to_a_power_score_is_said_as_their_games_say_it() -> None:
+    (run,) = [run for run, of in KEPT if of == "rewards" and run.trained_config.objective.reward_exponent < 1]
+    assert run.result is not None
+    hits, _ = hits_of(games := evaluated(run))
     assert games.truncated.all()
-    assert f"{games.scores.min():,.0f} to {games.scores.max():,.0f}, after" in RESULTS.read_text()
-    sideways = 200 * (hits["centre_vessel"] + hits["side_vessel"]) + 2_000 * (
-        hits["centre_bomber"] + hits["side_bomber"]
+    *_, hours = (
+        record.values["throughput/hours"]
+        for record in run.records()
+        if isinstance(record, Metrics) and "throughput/hours" in record.values
     )
+    mean, minutes = f"{games.scores.mean():,.0f}", f"{60 * hours:.0f} minutes on two cores"
+    readme, results = (" ".join(page.read_text().split()) for page in (REPOSITORY / "README.md", RESULTS))
+    low, high = games.scores.min(), games.scores.max()
+    assert f"{mean} points, all of a hundred games at the cap**, {low:,.0f} to {high:,.0f}, after {minutes};" in results
+    assert f"with its games the command took {60 * run.result.counts['hours']:.0f}." in results
+    assert f"has **{mean}**" in readme
+    assert f"has **{mean}**" in results
+    assert minutes in readme
+
+    sideways = sum(hits[f"{gun}_{ship}"] * pace.PAID[f"side_{ship}"] for gun, ship in GUNS_AND_SHIPS)
     most = (sideways + games.points[:, -1].sum()) / games.frames.sum()
-    assert f"were all of its hits by side guns, it would have {most:.1f}." in RESULTS.read_text()
+    assert f"were all of its hits by side guns, it would have {most:.1f}." in results
+
+    with (DOCS / "data" / "standard.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["step"] == "1000000" and row["evaluation"]]
+    halfway = {row["run"].split("-")[2]: f"{float(row['evaluation']):,.0f}" for row in rows}
+    early = EpisodeTable.read(run.artifact(evaluation_at(1_000_000))).scores.mean()
+    three = "{s0}, {s1} and {s2}".format(**halfway)
+    assert f"five games average {early:,.0f}, where the three have {three}." in results
+    third = of_the_fields_game()[2]
+    assert (
+        f"had {halfway['s2']} in five games after a million steps and {training_at(third, 1_000_000)[0]:.2f}" in results
+    )
 
 
 def test_the_three_networks_in_bfloat16_are_set_side_by_side_as_their_runs_are() -> None:
@@ -200,7 +232,7 @@ def test_published_curves_are_quoted_as_they_are() -> None:
 
 def test_the_fields_game_is_set_against_the_published_curves_as_both_are() -> None:
     means = {(row["name"], row["frames"]): row["mean"] for row in curves(game_of("Atlantis-v0"))}
-    (run,) = [run for run, folder in KEPT if folder == "standard" and run.trained_config.seed == 0]
+    run = of_the_fields_game()[0]
     evaluated_at = {2: evaluation_at(500_000), 4: evaluation_at(1_000_000), 5: evaluation_at(1_250_000)}
     for millions in range(2, 6):
         hours, training = training_at(run, 250_000 * millions)
@@ -215,22 +247,19 @@ def test_the_fields_game_is_set_against_the_published_curves_as_both_are() -> No
 
 def test_what_the_fields_game_scores_is_said_as_card_and_games_say_it() -> None:
     card, _ = read_card(REPOSITORY / "pretrained" / "cnn_standard")
-    first, third = sorted(
-        (run for run, folder in KEPT if folder == "standard"), key=lambda run: run.trained_config.seed
+    means = [games.scores.mean() for games in games_of_the_fields_game()]
+    minutes = [60 * training_at(run, 1_250_000)[0] for _, run in sorted(of_the_fields_game().items())]
+    readme, results = (
+        " ".join(page.read_text().replace("*", "").split()) for page in (REPOSITORY / "README.md", RESULTS)
     )
-    means = [games.scores.mean() for games in (evaluated(first), seed_1_of_the_fields_game(), evaluated(third))]
-    minutes = [60 * training_at(run, 1_250_000)[0] for run in (first, third)]
-    for page in (REPOSITORY / "README.md", RESULTS):
-        text = " ".join(page.read_text().replace("*", "").split())
+    for text in (readme, results):
         assert "have {:,.0f}, {:,.0f} and {:,.0f} points after five million frames".format(*means) in text
         assert "{:.0f} minutes on one core or {:.0f} on two".format(*minutes) in text
         assert f"{np.mean(card.scores):,.0f}" in text
-    assert f" {np.mean(card.scores):,.0f} over {len(card.scores)}," in " ".join(
-        (REPOSITORY / "README.md").read_text().split()
-    )
+    assert f" {np.mean(card.scores):,.0f} over {len(card.scores)}," in readme
     scores = (REPOSITORY / "pretrained" / "cnn_standard" / "README.md").read_text()
     (interval,) = re.findall(rf"^\| {np.mean(card.scores):,.0f} \| (\S+ to \S+) \|", scores, re.MULTILINE)
-    assert f"95 % interval {interval}, the lowest {min(card.scores):,.0f}." in RESULTS.read_text()
+    assert f"95 % interval {interval}, the lowest {min(card.scores):,.0f}." in results
 
 
 def test_what_is_kept_compares_as_it_did_and_names_no_place(
