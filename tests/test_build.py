@@ -55,6 +55,16 @@ def test_the_automatic_precision_is_the_faster_one(
     assert build.choose_precision("bf16", torch.device("cpu")) == "bf16"
 
 
+def test_a_gpu_is_asked_for_bits_that_repeat_and_for_all_of_float32(
+    tiny: Callable[..., Config], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What comes of it, only a GPU shows: tests/learning/test_on_a_gpu.py."""
+    monkeypatch.setattr(torch.backends.cudnn, "deterministic", False)
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
+    build_learner(tiny())
+    assert (torch.backends.cudnn.deterministic, torch.backends.cudnn.allow_tf32) == (True, False)
+
+
 @pytest.mark.parametrize(("capacity", "size"), [(120, 40), (70_000, 84)])
 def test_the_least_bytes_of_a_replay_memory_are_those_it_needs(
     tiny: Callable[..., Config], capacity: int, size: int

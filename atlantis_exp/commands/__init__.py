@@ -46,9 +46,10 @@ def main() -> None:
     else:
         verb, arguments = "train", sys.argv[1:]
     if {"--help", "-h"} & {*arguments}:
+        from atlantis_exp import terminal
         from atlantis_exp.commands.helping import help_text
 
-        print(help_text(verb, arguments))
+        terminal.console().print(help_text(verb, arguments))  # which a reader that has had enough does not hurt
         sys.exit(0)
     if "--version" in arguments:
         from importlib.metadata import version

@@ -82,6 +82,22 @@ def test_help_says_what_the_verb_does_and_which_verbs_there_are(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_help_that_nobody_reads_to_its_end_is_no_error() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)  # as `| head` does
+    with open(writer, "wb") as pipe:
+        asked = subprocess.run(
+            (sys.executable, "-m", "atlantis_exp", "--help"),
+            cwd=REPOSITORY,
+            stdout=pipe,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+            timeout=120,
+        )
+    assert asked.stderr == ""
+
+
 def test_showing_the_config_prints_one_that_is_valid_and_leaves_nothing_behind(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
