@@ -1,5 +1,6 @@
 """Each benchmark, at its smallest: it ends in one line of JSON with the figures that others read."""
 
+import csv
 import itertools
 import json
 import math
@@ -29,6 +30,7 @@ from benchmarks.composition import composed
 from benchmarks.contest import paired_ratio, ratio, take_turns
 from benchmarks.time_to_score import Turn, hours_to, sooner
 
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 Main = Callable[[Sequence[str]], None]
 
 needs_sb3 = pytest.mark.skipif(find_spec("stable_baselines3") is None, reason="stable-baselines3: extra `peers`")
@@ -207,6 +209,36 @@ def test_the_time_to_score_trains_in_turns_and_plays_after_each(capsys: pytest.C
     assert results["hours"]["62500"]["ours"] is None
     for _, steps, score in (first, second):  # an interrupted run has said what its turns led to
         assert f"ours: {score:,.0f} after {steps:,} steps" in printed.err
+
+
+def test_how_much_sooner_ours_scores_is_said_as_the_kept_turns_say_it() -> None:
+    text = (DOCS / "performance.md").read_text()
+    with (DOCS / "data" / "time_to_score.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    turns: dict[str, list[Turn]] = {}
+    before: dict[str, float] = {}
+    for row in rows:
+        program, hours = row["program"], float(row["hours"])
+        turn = Turn(hours - before.get(program, 0.0), int(row["steps"]), float(row["score"]))
+        turns.setdefault(program, []).append(turn)
+        before[program] = hours
+    for each in turns.values():
+        *earlier, last = each
+        minutes = sum(60 * turn.hours for turn in each)
+        assert f"after {minutes:.0f} minutes" in text
+        reached = [60 * hours_to(goal, each) for goal in time_to_score.GOALS]
+        told = ["not reached" if math.isinf(value) else f"{value:.0f} minutes" for value in reached]
+        highest = max(turn.score for turn in earlier)
+        rate = last.steps / minutes / 60
+        assert f"| {last.steps:,} | {rate:.0f} | {last.score:,.0f} | {highest:,.0f} | {' | '.join(told)} |" in text
+    sayings = ("**at least {:.1f} times sooner**", "at least {:.1f} times: the peers")
+    for goal, words in zip(time_to_score.GOALS, sayings, strict=True):
+        times, at_least = sooner(goal, turns) or (math.nan, False)
+        assert at_least
+        assert words.format(times) in text
+    first_goal = 60 * hours_to(time_to_score.GOALS[0], turns["ours"])
+    assert f"25,240, after {first_goal:.0f} minutes of training;" in (DOCS.parent / "README.md").read_text()
+    assert f"from {turns['ours'][0].score:,.0f} to {turns['ours'][-1].score:,.0f}" in text
 
 
 def test_a_ship_is_seen_in_its_lane_and_a_shot_is_none() -> None:
