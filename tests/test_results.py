@@ -155,6 +155,11 @@ def test_what_rewards_to_a_power_score_is_said_as_their_games_say_it() -> None:
     assert f"has **{mean}**" in results
     assert minutes in readme
 
+    calm = EpisodeTable.read(DOCS / "rewards" / "epsilon_0.001.csv")
+    low, high, rate = calm.scores.min(), calm.scores.max(), calm.scores.sum() / calm.frames.sum()
+    assert f"has **{calm.scores.mean():,.0f}**, {low:,.0f} to {high:,.0f}, {rate:.2f} points a frame" in results
+    assert f"costs {1 - games.scores.mean() / calm.scores.mean():.0%}." in results.replace(" %", "%")
+
     sideways = sum(hits[f"{gun}_{ship}"] * pace.PAID[f"side_{ship}"] for gun, ship in GUNS_AND_SHIPS)
     most = (sideways + games.points[:, -1].sum()) / games.frames.sum()
     assert f"were all of its hits by side guns, it would have {most:.1f}." in results
