@@ -250,10 +250,10 @@ def build_learner(config: cfg.Config) -> Learner:
 
 
 def _share_cores(config: cfg.Config, device: torch.device) -> int:
-    """Set torch's threads, keep memory that is freed and bits that repeat, for this process; the shards of a batch."""
+    """Set torch's threads, let it keep freed memory and repeat its bits, in this process; the shards of a batch."""
     keep_freed_memory()
-    torch.backends.cudnn.deterministic = True  # on a GPU: the same updates give the same bits
-    torch.backends.cudnn.allow_tf32 = False  # fp32 is what it says, and not the 10 bits of TF32
+    torch.backends.cudnn.deterministic = True  # on a GPU, where else some kernels add in any order
+    torch.backends.cudnn.allow_tf32 = False  # there, fp32 is no TensorFloat-32 by another name
     threads, component = config.threads or _THREADS, config.model.component
     is_split = component is not None and component.facts["splits_batches"]
     shards = threads if device.type == "cpu" and is_split else 1
