@@ -10,6 +10,7 @@ import sys
 from itertools import accumulate, groupby
 from pathlib import Path
 
+from make_results_picture import columns
 from matplotlib.figure import Figure
 
 from atlantis_exp.comparison.figures import thousands
@@ -44,8 +45,8 @@ def main() -> None:
     axes = figure.subplots()
     for program, points in groupby(rows, key=lambda row: row["program"]):
         label, colour, mark = SHOWN[program]
-        curve = [(60 * float(row["hours"]), float(row["score"])) for row in points]
-        axes.plot(*zip(*curve, strict=True), color=colour, marker=mark, markersize=4, linewidth=1.2, label=label)
+        curve = columns(list(points), "hours", "score", 1 / 60)
+        axes.plot(*curve, color=colour, marker=mark, markersize=4, linewidth=1.2, label=label)
     last = 60 * max(float(row["hours"]) for row in rows)
     for goal, what in zip(GOALS, ("the report's best mean", "its best game"), strict=True):
         axes.axhline(goal, color=GREY, linestyle=":", linewidth=1)
