@@ -243,14 +243,14 @@ def build_learner(config: cfg.Config) -> Learner:
         target_every=target.every,
         precision=choose_precision(config.training.precision, device),  # type: ignore[arg-type]
         target_mode=target.mode,
-        shards=_share_cores(config, device),
+        shards=_set_up_torch(config, device),
         ema=config.training.ema,
         compile=_compiled if config.compile else None,
     )
 
 
-def _share_cores(config: cfg.Config, device: torch.device) -> int:
-    """Set torch's threads, let it keep freed memory and repeat its bits, in this process; the shards of a batch."""
+def _set_up_torch(config: cfg.Config, device: torch.device) -> int:
+    """Set torch's threads in this process, let it keep freed memory and repeat its bits; the shards of a batch."""
     keep_freed_memory()
     torch.backends.cudnn.deterministic = True  # on a GPU, where else some kernels add in any order
     torch.backends.cudnn.allow_tf32 = False  # there, fp32 is no TensorFloat-32 by another name
@@ -318,7 +318,7 @@ def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Acto
     where = choose_device(device)
     network = build_trained_network(config, weights).to(where)
     precision = choose_precision(config.training.precision, where)
-    values = ActionValues(network, precision=precision, shards=_share_cores(config, where))  # type: ignore[arg-type]
+    values = ActionValues(network, precision=precision, shards=_set_up_torch(config, where))  # type: ignore[arg-type]
     return EpsilonGreedy(values.q_values, _num_actions(config), watches=True)
 
 

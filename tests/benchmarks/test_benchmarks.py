@@ -89,11 +89,19 @@ def test_emulation_measures_every_contestant(capsys: pytest.CaptureFixture[str])
 
 @pytest.mark.slow
 def test_evaluation_is_related_to_emulation_and_pass_and_a_film_to_its_processor_time(
-    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    rates: dict[str, list[float]] = {}
+
+    def kept(*arguments: Any) -> dict[str, list[float]]:
+        rates.update(take_turns(*arguments))
+        return rates
+
+    monkeypatch.setattr(evaluation, "take_turns", kept)
     arguments = "--num-envs 4 --rounds 1 --seconds 0.2 --film-steps 100"
     results = results_of(evaluation.main, arguments, capsys)
-    assert 0 < results["of_limit"] < 2
+    ((evaluated,), (emulated,), (passed,)) = rates.values()
+    assert results["of_limit"] == pytest.approx(evaluated / emulated + evaluated / passed)
     assert results["film_seconds"] > 0
 
 
