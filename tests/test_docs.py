@@ -14,7 +14,12 @@ from atlantis_exp.runs.folder import all_runs
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
-OF_DATA = {"ladder": "make_ladder", "fast": "make_results_picture", "standard": "make_standard_picture"}
+OF_DATA = {
+    "ladder": ("make_ladder",),
+    "fast": ("make_results_picture",),
+    "standard": ("make_standard_picture", "standard"),
+    "million": ("make_standard_picture", "million"),
+}
 
 
 @pytest.fixture
@@ -28,7 +33,7 @@ def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Non
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path / "docs")
 
-    def call(name: str, *arguments: Path) -> None:
+    def call(name: str, *arguments: Path | str) -> None:
         monkeypatch.setattr("sys.argv", [f"docs/{name}.py", *map(str, arguments)])
         runpy.run_path(f"docs/{name}.py", run_name="__main__")
 
@@ -46,7 +51,7 @@ def assert_it_is_drawn(name: str, share: float = 0.005) -> None:
 
 @pytest.mark.parametrize("picture", OF_DATA)
 def test_a_picture_of_trainings_is_of_their_table(picture: str, script: Callable[..., None]) -> None:
-    script(OF_DATA[picture])
+    script(*OF_DATA[picture])
     assert_it_is_drawn(picture)
     assert (Path("docs/data") / f"{picture}.csv").read_bytes() == (DOCS / "data" / f"{picture}.csv").read_bytes()
 
