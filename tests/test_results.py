@@ -57,9 +57,9 @@ def games_of_the_fields_game() -> list[EpisodeTable]:
     return [evaluated(runs[0]), EpisodeTable.read(DOCS / "standard" / "seed_1.csv", SOURCES), evaluated(runs[2])]
 
 
-def training_at(run: RunFolder, step: int) -> tuple[float, float]:
+def training_at(run: RunFolder, step: int, table: str = "standard") -> tuple[float, float]:
     """The hours until a step and the mean of 20 there, as the page's picture has them."""
-    with (DOCS / "data" / "standard.csv").open() as file:
+    with (DOCS / "data" / f"{table}.csv").open() as file:
         row = next(row for row in csv.DictReader(file) if row["run"] == run.name and int(row["step"]) == step)
     return float(row["hours"]), float(row["mean_20"])
 
@@ -139,7 +139,7 @@ def test_the_pace_of_trainings_with_other_rewards_is_said_as_their_games_say_it(
 def test_what_rewards_to_a_power_score_is_said_as_their_games_say_it() -> None:
     (run,) = [run for run, of in KEPT if of == "rewards" and run.trained_config.objective.reward_exponent < 1]
     assert run.result is not None
-    hits, _ = hits_of(games := evaluated(run))
+    games = evaluated(run)
     assert games.truncated.all()
     *_, hours = (
         record.values["throughput/hours"]
@@ -153,16 +153,6 @@ def test_what_rewards_to_a_power_score_is_said_as_their_games_say_it() -> None:
     assert f"with its games the command took {60 * run.result.counts['hours']:.0f}." in results
     assert f"has **{mean}**" in readme
     assert f"has **{mean}**" in results
-    assert minutes in readme
-
-    calm = EpisodeTable.read(DOCS / "rewards" / "epsilon_0.001.csv")
-    low, high, rate = calm.scores.min(), calm.scores.max(), calm.scores.sum() / calm.frames.sum()
-    assert f"has **{calm.scores.mean():,.0f}**, {low:,.0f} to {high:,.0f}, {rate:.2f} points a frame" in results
-    assert f"costs {1 - games.scores.mean() / calm.scores.mean():.0%}." in results.replace(" %", "%")
-
-    sideways = sum(hits[f"{gun}_{ship}"] * pace.PAID[f"side_{ship}"] for gun, ship in GUNS_AND_SHIPS)
-    most = (sideways + games.points[:, -1].sum()) / games.frames.sum()
-    assert f"were all of its hits by side guns, it would have {most:.1f}." in results
 
     with (DOCS / "data" / "standard.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["step"] == "1000000" and row["evaluation"]]
@@ -174,6 +164,57 @@ def test_what_rewards_to_a_power_score_is_said_as_their_games_say_it() -> None:
     assert (
         f"had {halfway['s2']} in five games after a million steps and {training_at(third, 1_000_000)[0]:.2f}" in results
     )
+
+
+def test_what_four_million_steps_bring_is_said_as_their_games_say_it() -> None:
+    (run,) = [run for run, of in KEPT if of == "longer" and run.trained_config.objective.reward_exponent < 1]
+    means = {(row["name"], row["frames"]): row["mean"] for row in curves(game_of("Atlantis-v0"))}
+    steps = sorted(int(path.stem) for path in run.artifact("evaluation").glob("*.csv"))
+    assert steps[-1] == 4_000_000
+    for step in steps:
+        games = EpisodeTable.read(run.artifact(evaluation_at(step)), SOURCES)
+        rate, hits, side, *_, mean = pace_of(games)
+        hours, _ = training_at(run, step, "million")
+        published = [means.get((name, 4.0 * step)) for name in ("DreamerV3", "QR-DQN Impala ResNet")]
+        cells = (
+            *(f" {step / 250_000:g} ", f" {hours:.2f} ", f" {rate:.2f} ", f" {hits:.1f} ", f" {side:.0f} % "),
+            *(f" {mean:,.0f} ", f" {len(games.scores)} "),
+            *(" " if score is None else f" {score:,.0f} " for score in published),
+        )
+        assert f"|{'|'.join(cells)}|" in RESULTS.read_text()
+
+    readme, results = (" ".join(page.read_text().split()) for page in (REPOSITORY / "README.md", RESULTS))
+    capped = games.truncated.astype(bool)
+    assert (
+        f"The last hundred games have {mean:,.0f} points: {capped.sum()} reach the cap, with "
+        f"{games.scores[capped].mean():,.0f} on average"
+    ) in results
+    early = np.sort(games.steps[~capped])[:-1]
+    assert f"and {len(early)} of the others are over within their first {early.max():,.0f} steps" in results
+    with run.artifact("episodes.csv").open() as file:
+        ended = [(int(row["step"]), int(row["length"])) for row in csv.DictReader(file)]
+    lost = [length for step, length in ended if step - 16 * length >= 2_600_000 and length < 27_000]
+    began = np.array([step for step, _ in ended if step > 2_600_000])  # where one ends the next one begins
+    late, before = (began > 3_900_000).sum(), (began < 3_900_000).sum()
+    assert len(lost) == 3
+    assert (
+        f"Of the {late} games that began in the last 100,000 steps three were lost within {max(lost)} steps, of the "
+        f"{before} before them none."
+    ) in results
+    card, _ = read_card(REPOSITORY / "pretrained" / "cnn_standard")
+    hours, _ = training_at(run, card.step, "million")
+    calm = EpisodeTable.read(DOCS / "longer" / "epsilon_0.001.csv", SOURCES)
+    for text in (readme, results):
+        assert f"after {hours:.1f} hours on two cores" in text
+        assert f"**{calm.scores.mean():,.0f}**" in text
+    low, high, rate = calm.scores.min(), calm.scores.max(), calm.scores.sum() / calm.frames.sum()
+    assert f"has **{calm.scores.mean():,.0f}**, {low:,.0f} to {high:,.0f}, {rate:.2f} points a frame" in results
+    assert f"{(calm.scores > 1_000_000).sum()} of the games pass it." in results
+    assert f"costs {1 - np.mean(card.scores) / calm.scores.mean():.0%}." in results.replace(" %", "%")
+    landed, _ = hits_of(calm)
+    sideways = sum(landed[f"{gun}_{ship}"] * pace.PAID[f"side_{ship}"] for gun, ship in GUNS_AND_SHIPS)
+    most = (sideways + calm.points[:, -1].sum()) / calm.frames.sum()
+    assert f"were all of its hits by side guns, it would have {most:.1f}." in results
 
 
 def test_the_three_networks_in_bfloat16_are_set_side_by_side_as_their_runs_are() -> None:
