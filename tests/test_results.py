@@ -17,7 +17,7 @@ from atlantis_exp.decision import mean_interval
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.folder import RunFolder, all_runs, evaluation_at
 from atlantis_exp.runs.journal import Metrics, Tags
-from atlantis_exp.sessions.cards import read_card
+from atlantis_exp.sessions.cards import read_card, side_by_side
 from atlantis_exp.statistics import interquartile_mean
 from benchmarks import pace
 
@@ -209,6 +209,8 @@ def test_what_four_million_steps_bring_is_said_as_their_games_say_it() -> None:
         assert f"**{calm.scores.mean():,.0f}**" in text
     low, high, rate = calm.scores.min(), calm.scores.max(), calm.scores.sum() / calm.frames.sum()
     assert f"has **{calm.scores.mean():,.0f}**, {low:,.0f} to {high:,.0f}, {rate:.2f} points a frame" in results
+    _, here = side_by_side(card, card.evaluation, calm.scores.tolist()).columns[2].cells
+    assert f"The 95 % interval of this mean, {here}, holds a million;" in results
     assert f"{(calm.scores > 1_000_000).sum()} of the games pass it." in results
     assert f"costs {1 - np.mean(card.scores) / calm.scores.mean():.0%}." in results.replace(" %", "%")
     landed, _ = hits_of(calm)
