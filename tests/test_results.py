@@ -222,27 +222,46 @@ def test_what_four_million_steps_bring_is_said_as_their_games_say_it() -> None:
 def test_the_three_networks_in_bfloat16_are_set_side_by_side_as_their_runs_are() -> None:
     readme, results = (" ".join(page.read_text().split()) for page in (REPOSITORY / "README.md", RESULTS))
     teraflops: dict[str, float] = {}
-    noop: dict[str, float] = {}
+    habits: dict[str, list[tuple[float, float, float]]] = {}  # a seed: NOOP and side guns in percent, hits
+    played: dict[str, list[EpisodeTable]] = {}
     for model, network in (("cnn", "DQNCnn"), ("resnet_fast", "ResNetFast"), ("resnet", "ResNetDQN")):
-        run = of_the_verdict("uniform", model, "bf16")[0]
-        assert run.result is not None
-        tags = [record.values for record in run.records() if isinstance(record, Tags)]
-        (flops,) = (float(values["flops_per_update"]) for values in tags if "flops_per_update" in values)
-        counts, games = run.result.counts, evaluated(run)
-        teraflops[network] = flops * counts["updates"] / 1e12
-        noop[network] = 100 * run.result.evaluation["actions/favourite_share"]
-        rate, mean = games.scores.sum() / games.frames.sum(), games.scores.mean()
-        config = run.trained_config
-        assert (
-            f"| {network} | {config.threads} | {counts['hours']:.2f} | {teraflops[network]:,.0f} | {rate:.2f} | "
-            f"{games.steps.mean():,.0f} | {mean:,.0f} ({interquartile_mean(games.scores):,.0f}) |"
-        ) in results
-        assert f"{network} {mean:,.0f}" in readme
-    assert f"but from {games.scores.min():,.0f} to {games.scores.max():,.0f} points" in results  # ResNetDQN's
-    assert f"ResNetDQN scores {mean:,.0f} by the recipe" in results
+        for seed, run in of_the_verdict("uniform", model, "bf16").items():
+            assert run.result is not None
+            tags = [record.values for record in run.records() if isinstance(record, Tags)]
+            (flops,) = (float(values["flops_per_update"]) for values in tags if "flops_per_update" in values)
+            counts, config, games = run.result.counts, run.trained_config, evaluated(run)
+            teraflops[network] = flops * counts["updates"] / 1e12
+            rate, hits, side, *_, mean = pace_of(games)
+            assert (
+                f"| {seed} | {network} | {config.threads} | {counts['hours']:.2f} | {teraflops[network]:,.0f} | "
+                f"{rate:.2f} | {games.steps.mean():,.0f} | {mean:,.0f} ({interquartile_mean(games.scores):,.0f}) |"
+            ) in results
+            chosen = games.counts[..., 0].sum(axis=0)
+            wait = 100 * chosen[games.actions.index("NOOP")] / chosen.sum()
+            habits.setdefault(network, []).append((wait, side, hits))
+            played.setdefault(network, []).append(games)
+    ten = [
+        [evaluated(run).scores.mean() for run in of_the_verdict("uniform", model).values()]
+        for model in ("cnn", "resnet_fast")
+    ]
+    (low, high), (least, most) = ((f"{min(means):,.0f}", f"{max(means):,.0f}") for means in ten)
+    assert f"trainings of DQNCnn have {low} to {high}, ten of ResNetFast {least} to {most}." in results
+    assert f"those of DQNCnn lie between {low} and {high}, those of ResNetFast between {least} and {most}:" in results
+    one, other = (games.scores.mean() for games in played["ResNetDQN"])
+    assert all(min(means) < one < max(means) and other < min(means) for means in ten)
+    both = f"{one:,.0f} and {other:,.0f}"
+    for network in ("DQNCnn", "ResNetFast"):
+        assert f"{network} {played[network][0].scores.mean():,.0f}" in readme
+    assert f"ResNetDQN {both}" in readme
+    assert f"ResNetDQN scores {both} by the recipe" in results
+    scores = np.concatenate([games.scores for games in played["ResNetDQN"]])
+    assert f"from {scores.min():,.0f} to {scores.max():,.0f} points" in results
+    ((wait, side, hits),), ((wait_0, side_0, hits_0), (wait_1, side_1, hits_1)) = habits["DQNCnn"], habits["ResNetDQN"]
     assert (
-        f"NOOP in {noop['ResNetDQN']:.0f} % of the network's decisions, {noop['DQNCnn']:.0f} % of DQNCnn's" in results
-    )
+        f"NOOP in {wait_0:.0f} % and {wait_1:.0f} % of the network's decisions where DQNCnn has {wait:.0f} %. "
+        f"Of its hits {side_0:.0f} % and {side_1:.0f} % are by the side guns, which pay double (DQNCnn: {side:.0f} %), "
+        f"but it has {hits_0:.1f} and {hits_1:.1f} of them a thousand frames (DQNCnn: {hits:.1f}), and so"
+    ) in results
     more = f"{teraflops['ResNetDQN'] / teraflops['DQNCnn']:.1f} times the arithmetic of DQNCnn"
     assert more in readme
     assert results.count(more) == 2
