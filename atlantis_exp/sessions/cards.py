@@ -17,12 +17,12 @@ from atlantis_exp.build import build_network_actor, described
 from atlantis_exp.checking import nearest, parse, to_dict
 from atlantis_exp.config import STRICT, Config, EvaluationConfig, PathsConfig
 from atlantis_exp.faults import ConfigError, Fault
-from atlantis_exp.runs.files import SMALL, read_file, read_object
+from atlantis_exp.runs.files import ARTIFACT, SMALL, read_file, read_object
 from atlantis_exp.statistics import interval, resample, summarize
 from atlantis_exp.training.actor import Actor
 from atlantis_exp.training.evaluation import Evaluation
 
-MOST_BYTES = 8_000_000  # of the weights, since they lie in a repository
+SINGLE = 8_000_000  # bytes; larger weights are handed on in half precision, since they often lie in a repository
 
 _COLUMNS = ("mean", "95 % interval", "median", "IQM", "high", "low", "episodes", "epsilon", "seed")
 _RESAMPLES = 10_000  # bootstrap samples
@@ -63,7 +63,7 @@ def read_card(folder: Path) -> tuple[Card, bytes]:
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: {error}") from None
     try:
-        weights = read_file((folder / "weights.safetensors").resolve(), MOST_BYTES)
+        weights = read_file((folder / "weights.safetensors").resolve(), ARTIFACT)
     except (OSError, ValueError) as error:
         raise Fault(f"{folder}: its weights cannot be read: {error}") from None
     if hashlib.sha256(weights).hexdigest() != card.sha256:
@@ -87,19 +87,12 @@ def write_card(folder: Path, card: Card, weights: bytes, evaluation: Evaluation,
 
 
 def pack(weights: bytes) -> tuple[bytes, Literal["float32", "float16"]]:
-    """Weights as safetensors of at most `MOST_BYTES`, in half precision where they have to be.
-
-    Raises:
-        Fault: where that is too large, too.
-    """
-    if len(weights) <= MOST_BYTES:
+    """Weights as safetensors, in half precision where they take more than `SINGLE`."""
+    if len(weights) <= SINGLE:
         return weights, "float32"
     arrays = safetensors.numpy.load(weights)
     half = {name: array.astype(np.float16) if array.dtype == np.float32 else array for name, array in arrays.items()}
-    packed = safetensors.numpy.save(half)
-    if len(packed) > MOST_BYTES:
-        raise Fault(f"the weights take {len(packed):,} bytes in half precision; an export has {MOST_BYTES:,} at most")
-    return packed, "float16"
+    return safetensors.numpy.save(half), "float16"
 
 
 def portable(config: Config) -> Config:

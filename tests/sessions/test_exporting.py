@@ -116,7 +116,7 @@ def test_exported_weights_score_what_their_card_says(
     command: Command, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """In half precision, which is what this limit takes."""
-    monkeypatch.setattr(cards, "MOST_BYTES", 300_000)
+    monkeypatch.setattr(cards, "SINGLE", 300_000)
     folder = tmp_path / "pretrained" / "tiny"
     outputs = (f"paths.outputs={trained}", "device=cpu")
     assert command("export", f"to={folder}", "episodes=3", "epsilon=0.9", "evaluation.num_envs=1", *outputs) == 0
