@@ -5,7 +5,7 @@ import itertools
 import re
 import runpy
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +43,11 @@ def of_the_verdict(sampler: str, model: str = "cnn", precision: str = "fp32") ->
     runs = [run for run, folder in KEPT if folder == "verdict" and run.name.startswith(f"{model}-{sampler}-")]
     configs = [(run, run.trained_config) for run in runs]
     return {config.seed: run for run, config in configs if config.training.precision == precision}
+
+
+def listed(words: Sequence[str]) -> str:
+    """Words as a sentence lists them."""
+    return f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def of_the_fields_game() -> dict[int, RunFolder]:
@@ -249,26 +254,28 @@ def test_the_three_networks_in_bfloat16_are_set_side_by_side_as_their_runs_are()
     assert f"trainings of DQNCnn have {low} to {high}, ten of ResNetFast {least} to {most}." in results
     assert f"those of DQNCnn lie between {low} and {high}, those of ResNetFast between {least} and {most}:" in results
     means = {network: [games.scores.mean() for games in each] for network, each in played.items()}
-    one, other = means["ResNetDQN"]
+    one, other, *_ = means["ResNetDQN"]
     assert all(min(scores) < one < max(scores) and other < min(scores) for scores in ten)
     assert means["DQNCnn"][1] < min(ten[0])
-    assert np.less(means["ResNetDQN"], means["DQNCnn"]).all()
-    both, same = (" and ".join(f"{mean:,.0f}" for mean in means[network]) for network in ("ResNetDQN", "DQNCnn"))
-    assert f"ResNetDQN {both}" in readme
+    pairs = [*zip(played["ResNetDQN"], played["DQNCnn"], strict=False)]  # of equal seeds
+    assert all(residual.scores.mean() < plain.scores.mean() for residual, plain in pairs)
+    all_of, same = (listed([f"{mean:,.0f}" for mean in means[network]]) for network in ("ResNetDQN", "DQNCnn"))
+    assert f"ResNetDQN {all_of}" in readme
     assert f"with the same seeds DQNCnn {same}, with the first one's ResNetFast {means['ResNetFast'][0]:,.0f}" in readme
-    assert f"ResNetDQN scores {both} by the recipe" in results
+    assert f"ResNetDQN scores {all_of} by the recipe" in results
     assert f"which has {same} with the same seeds." in results
     scores = np.concatenate([games.scores for games in played["ResNetDQN"]])
     assert f"they differ more, from {scores.min():,.0f} to {scores.max():,.0f} points" in results
-    for ours, theirs in zip(played["ResNetDQN"], played["DQNCnn"], strict=True):
-        assert ours.scores.std() > theirs.scores.std()
-        assert ours.steps.mean() == pytest.approx(theirs.steps.mean(), rel=0.1)  # about as long
+    for residual, plain in pairs:
+        assert residual.scores.std() > plain.scores.std()
+        assert residual.steps.mean() == pytest.approx(plain.steps.mean(), rel=0.1)  # about as long
     wait, side, hits = habits["DQNCnn"][0]
-    (wait_0, side_0, hits_0), (wait_1, side_1, hits_1) = habits["ResNetDQN"]
+    waits, sides, frequent = zip(*habits["ResNetDQN"], strict=True)
     assert (
-        f"NOOP in {wait_0:.0f} % and {wait_1:.0f} % of the network's decisions where DQNCnn's seed 0 has {wait:.0f} %. "
-        f"Of its hits {side_0:.0f} % and {side_1:.0f} % are by the side guns, which pay double (DQNCnn: {side:.0f} %), "
-        f"but it has {hits_0:.1f} and {hits_1:.1f} of them a thousand frames (DQNCnn: {hits:.1f}), and so"
+        f"NOOP in {listed([f'{each:.0f} %' for each in waits])} of the network's decisions where DQNCnn's seed 0 has "
+        f"{wait:.0f} %. Of its hits {listed([f'{each:.0f} %' for each in sides])} are by the side guns, which pay "
+        f"double (DQNCnn: {side:.0f} %), but it has {listed([f'{each:.1f}' for each in frequent])} of them a thousand "
+        f"frames (DQNCnn: {hits:.1f}), and so"
     ) in results
     more = f"{teraflops['ResNetDQN'] / teraflops['DQNCnn']:.1f} times the arithmetic of DQNCnn"
     assert more in readme
