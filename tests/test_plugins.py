@@ -50,10 +50,14 @@ class MyNet(nn.Module):
         super().__init__()
         channels, height, side = input_shape
         self.features = nn.Sequential(nn.Conv2d(channels, width, 8, 8), nn.ReLU() if act == "relu" else nn.SiLU())
+        self.mix, self.mix_again = nn.Conv2d(width, width, 1), nn.Conv2d(width, width, 1)
+        self.mix_again.weight = self.mix.weight  # tied
+        self.scale = nn.Parameter(torch.tensor(0.1))
         self.head = head(width * (height // 8) * (side // 8), num_actions)
 
     def forward(self, x):
-        return self.head(self.features(x).flatten(1))
+        x = self.features(x)
+        return self.head((x + self.scale * self.mix_again(self.mix(x))).flatten(1))
 """
 OTHERS = '''
 from dataclasses import dataclass

@@ -248,13 +248,15 @@ class Learner(ActionValues):
         """
         parameters = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
         kept = {int(index): values for index, values in state["optimizer"].items()}
-        forms = {
+        names = {frozenset(values) for values in kept.values()}
+        of_its_size = {
             frozenset(
-                (name, getattr(value, "shape", None) == parameters[index].shape) for name, value in values.items()
+                name for name, value in values.items() if getattr(value, "shape", None) == parameters[index].shape
             )
             for index, values in kept.items()
+            if parameters[index].dim()  # a parameter that is one number is as large as the count of its steps
         }
-        if len(forms) > 1:  # torch's load takes it, and the next update breaks off
+        if len(names) > 1 or len(of_its_size) > 1:  # torch's load takes it, and the next update breaks off
             raise ValueError("the optimizer's state does not fit its parameters")
         self.network.load_state_dict(state["network"])
         self.target.load_state_dict(state["target"])

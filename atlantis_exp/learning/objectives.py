@@ -79,7 +79,7 @@ class Quantile(DQN):
     """
 
     head: ClassVar = "quantile"
-    quantiles: Annotated[int, Interval(ge=1, le=10_000)]
+    quantiles: Annotated[int, Interval(ge=1, le=1_000)]  # a sample of an update holds N x N differences
 
     def losses(self, q: torch.Tensor, a_t: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Return the quantile Huber loss of each sample, (B,): a sum over its quantiles, a mean over the target's."""

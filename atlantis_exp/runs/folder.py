@@ -13,7 +13,7 @@ from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.runs import lock
 from atlantis_exp.runs.files import SMALL, inside, read_file, schema_of, write_file
-from atlantis_exp.runs.journal import Commit, Record, Status, read, read_commit
+from atlantis_exp.runs.journal import Commit, Record, Status, has_lost_commit, read, read_commit
 
 CONFIG, RESULT, COMMIT = "config.json", "result.json", "commit.json"
 TRACEBACK = "traceback.txt"
@@ -122,7 +122,8 @@ class RunFolder:
     def has_lost_checkpoints(self) -> bool:
         """Whether there was a commit and there is no checkpoint, as in a folder that was brought without them."""
         commit = self.commit
-        return commit is not None and commit.offset > 0 and not any(self.checkpoints.glob("*/manifest.json"))
+        was_committed = (commit is not None and commit.offset > 0) or has_lost_commit(self.path)
+        return was_committed and not any(self.checkpoints.glob("*/manifest.json"))
 
     @property
     def commit(self) -> Commit | None:
@@ -201,8 +202,22 @@ def all_runs(outputs: Path) -> list[RunFolder]:
 
 
 def find_run(outputs: Path, name: str) -> RunFolder:
-    """The training run of that name, that start of a name, or the latest. Raises: ConfigError."""
-    folders = [folder for folder in all_runs(outputs) if "model" in folder.config]
+    """The training run of that name, that start of a name, or the latest.
+
+    Raises:
+        ConfigError: where it is none or not the only one.
+        Fault: where it is damaged.
+    """
+
+    def is_training(folder: RunFolder) -> bool:
+        try:
+            return "model" in folder.config
+        except Fault:
+            if folder.name == name:
+                raise
+            return False  # no obstacle to another
+
+    folders = [folder for folder in all_runs(outputs) if is_training(folder)]
     if not folders:
         raise ConfigError(f"run={name}: there is no training run under {outputs / 'runs'}")
     if name == "latest":

@@ -12,7 +12,7 @@ import re
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, Protocol, get_args
@@ -210,6 +210,13 @@ class Journal:
         self.load_state_dict({"offset": self._commit.offset, "time": self._commit.updated})
         return True
 
+    def recover(self) -> None:
+        """Makes all that is in the folder count again, as where the `commit.json` of an ended run was removed."""
+        with open_file(self._folder / "journal.jsonl") as file:
+            self._offset = sum(len(line) for line in iter(partial(file.readline, SMALL), b"") if line.endswith(b"\n"))
+        self.commit()
+        self.status("FINISHED")
+
     def metrics(self, values: Mapping[str, float], step: int) -> None:
         self._time = max(self._time, _now())
         self._append(Metrics(step, self._time, {_name(key): float(value) for key, value in values.items()}))
@@ -305,6 +312,17 @@ def read_commit(folder: Path) -> Commit | None:
         return commit_of(read_file(path, SMALL)) if path.exists() else None
     except ValueError:
         raise JournalError(f"{path} is damaged: remove it and issue the run's command again") from None
+
+
+def has_lost_commit(folder: Path) -> bool:
+    """Returns whether a run folder's journal holds something that once counted and no `commit.json` speaks for.
+
+    Raises:
+        JournalError: on a folder whose `commit.json` is damaged.
+    """
+    commit, path = read_commit(folder), folder / "journal.jsonl"
+    is_new = commit is None or (commit.status == "SCHEDULED" and not commit.offset)  # as a sweep makes it anew
+    return is_new and path.exists() and path.stat().st_size > 0
 
 
 def commit_of(content: bytes) -> Commit:

@@ -30,6 +30,7 @@ from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.training import expected
 from atlantis_exp.sessions.verifying import fingerprints, train_and_kill
+from atlantis_exp.training.checkpoint import to_safetensors
 from atlantis_exp.training.progress import Progress
 
 _SIDES = (84, 159)  # pixels
@@ -138,7 +139,7 @@ def _same_weights(config: Config) -> None:
 
 def _there_and_back(config: Config) -> None:
     side = _side(config)
-    stored = safetensors.torch.load(safetensors.torch.save(_made(config, side, seed=1).state_dict()))
+    stored = safetensors.torch.load(to_safetensors(_made(config, side, seed=1).state_dict()))
     with torch.device("meta"):
         build_component(config, config.model, (config.env.stack, side, side), _ACTIONS, nn.Linear).load_state_dict(
             stored, assign=True

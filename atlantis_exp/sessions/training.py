@@ -19,7 +19,7 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault, RunFault
 from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import CONFIG, LOST, TRACEBACK, Result, RunFolder, all_runs
-from atlantis_exp.runs.journal import Journal, adopt
+from atlantis_exp.runs.journal import Journal, adopt, has_lost_commit
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.cards import read_card
 from atlantis_exp.sessions.job import Job, labels
@@ -51,9 +51,8 @@ def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int |
     progress = Progress()
     stop = StopRequest(config.budget.seconds, sweep_goes_on(folder, job.launcher))
     tracking = config.tracking if job.launcher is None else dataclasses.replace(config.tracking, name="none")
-    shown = {**labels(job.title, job.colour, "training"), "group": job.group}
     about = f"Network `{config.model.name}` on {config.env.id}, seed {config.seed}. Continue or report: `{job.command}`"
-    with folder.held(), stop.installed(), publishing(folder, tracking, job.outputs, shown) as journal:
+    with folder.held(), stop.installed(), publishing(folder, tracking, job.outputs, _labels(job)) as journal:
         with _faults_recorded(job, folder, journal), closing(progress):
             with terminal.working("making the network and the emulators"):
                 trainer = build_trainer(config, folder.path, journal, progress, about)
@@ -75,9 +74,16 @@ def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int |
     return stop.signal
 
 
+def _labels(job: Job) -> dict[str, str]:
+    return {**labels(job.title, job.colour, "training"), "group": job.group}
+
+
 def _has_ended(job: Job, folder: RunFolder) -> bool:
     """Whether there is nothing to train, which is then said; puts a run aside that is to be started over."""
     config = job.config
+    if folder.result is not None and has_lost_commit(folder.path):
+        with folder.held():
+            Journal(folder.path, _labels(job)).recover()
     if job.launcher is None:
         catch_up(job.outputs, config.tracking.uri, folder.path if folder.result is None else None)
     if not sweep_goes_on(folder, job.launcher)():

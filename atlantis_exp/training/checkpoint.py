@@ -1,5 +1,6 @@
 """Checkpoints: the state of a whole training, written so that a crash at any moment leaves the last whole one."""
 
+import errno
 import hashlib
 import json
 import shutil
@@ -22,9 +23,11 @@ FORMAT = 1
 _SEGMENTS = 64  # of a full memory, about
 _DAMAGED = (
     *(OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RuntimeError),
-    *(MemoryError, SafetensorError),
+    SafetensorError,
 )
 """What comes of a state that is not what was saved."""
+_FOR_GOOD = {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENXIO, errno.EIO}
+"""Why a file that was saved is not there any more; any other reason may pass, as a file server's."""
 
 
 class CheckpointError(Fault):
@@ -38,9 +41,16 @@ def unforged(folder: Path) -> Iterator[None]:
         yield
     except Fault:
         raise
-    except _DAMAGED as error:
+    except (*_DAMAGED, MemoryError) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise CheckpointError(f"the checkpoint in {folder} is none of this training ({reason})") from None
+
+
+def to_safetensors(tensors: Mapping[str, torch.Tensor]) -> bytes:
+    """Tensors by name as safetensors."""
+    # Of copies, since it refuses what shares memory, as tied weights do.
+    copies = {name: tensor.detach().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()}
+    return safetensors.torch.save(copies)
 
 
 class Checkpoints:
@@ -94,7 +104,8 @@ class Checkpoints:
         `lost` says how many that costs.
 
         Raises:
-            CheckpointError: if all generations are damaged, or the newest is of another experiment or a newer format.
+            CheckpointError: if all generations are damaged, the newest is of another experiment or a newer format, or
+                a file may be whole but cannot be read now; on disk all stays as it is.
         """
         faults: list[str] = []
         state = self._load(memory, False, faults)
@@ -113,7 +124,7 @@ class Checkpoints:
         """The newest generation's state that can be read, with the faults of those that cannot."""
         for generation in sorted(self._generations(), reverse=True):
             try:
-                manifest = read_object(read_file(self.folder / _name(generation) / "manifest.json", SMALL))
+                manifest = read_object(self._content(f"{_name(generation)}/manifest.json", SMALL))
                 if manifest.pop("sha256") != _checksum(manifest):
                     raise ValueError("its manifest does not have its checksum")
                 self._refuse_foreign(manifest, generation)
@@ -125,6 +136,8 @@ class Checkpoints:
                     segments = self._load_what_is_left(memory, segments)
             except CheckpointError:
                 raise
+            except MemoryError:
+                raise self._not_now("this takes more memory than there is") from None
             except _DAMAGED as error:
                 faults.append(f"checkpoint {generation} in {self.folder} is damaged ({error})")
                 continue
@@ -169,7 +182,7 @@ class Checkpoints:
         arrays: dict[str, np.ndarray[Any, Any]] = {}
         files = {"state.json": json.dumps(_disassemble(tree, "", tensors, arrays)).encode()}
         if tensors:
-            files["tensors.safetensors"] = safetensors.torch.save(tensors)
+            files["tensors.safetensors"] = to_safetensors(tensors)
         if arrays:
             files["arrays.safetensors"] = safetensors.numpy.save(arrays)
         for file, content in files.items():
@@ -179,7 +192,7 @@ class Checkpoints:
     def _read(self, name: str, checksums: Mapping[str, str]) -> dict[str, Any]:
         if not set(checksums) <= {"state.json", "tensors.safetensors", "arrays.safetensors"}:
             raise ValueError("its manifest names files that no checkpoint has")
-        contents = {file: read_file(inside(self.folder, f"{name}/{file}"), CHECKPOINT) for file in checksums}
+        contents = {file: self._content(f"{name}/{file}", CHECKPOINT) for file in checksums}
         for file, content in contents.items():
             if hashlib.sha256(content).hexdigest() != checksums[file]:
                 raise ValueError(f"{name}/{file} does not have its checksum")
@@ -187,6 +200,21 @@ class Checkpoints:
         arrays = safetensors.numpy.load(contents["arrays.safetensors"]) if "arrays.safetensors" in contents else {}
         tree: dict[str, Any] = _assemble(read_object(contents["state.json"]), tensors, arrays)
         return tree
+
+    def _content(self, name: str, most: int) -> bytes:
+        """A file's bytes. Raises: CheckpointError where it may be whole; OSError and ValueError where it is not."""
+        try:
+            return read_file(inside(self.folder, name), most)
+        except OSError as error:
+            if error.errno in _FOR_GOOD:
+                raise
+            raise self._not_now(error.strerror) from error
+
+    def _not_now(self, reason: str) -> CheckpointError:
+        return CheckpointError(
+            f"the checkpoints in {self.folder} cannot be read now ({reason}), but may be whole; the same command tries "
+            f"again, resume=never keeps what is there and begins anew"
+        )
 
     def _clean(self, generation: int, segments: set[str]) -> None:
         """Remove generations but this one and the one before, and all segments but theirs."""
@@ -217,7 +245,7 @@ def _disassemble(
 ) -> Any:
     """The tree with every tensor and array moved into its table, under the path it was found at."""
     if isinstance(node, torch.Tensor):
-        tensors[path] = node.detach().contiguous()
+        tensors[path] = node
         return {"$tensor": path}
     if isinstance(node, np.ndarray):
         arrays[path] = np.ascontiguousarray(node)

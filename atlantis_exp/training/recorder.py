@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-import safetensors.torch
 
 from atlantis_exp.faults import Fault
 from atlantis_exp.learning.learner import Learner
@@ -18,6 +17,7 @@ from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.runs.folder import BEST_EPISODE, EPISODES, NETWORK, evaluation_at
 from atlantis_exp.runs.journal import Tracker
+from atlantis_exp.training.checkpoint import to_safetensors
 from atlantis_exp.training.evaluation import Evaluation, Stopped
 from atlantis_exp.training.plan import Cadence, Counters, Plan
 from atlantis_exp.training.progress import Pace, Progress, Snapshot
@@ -189,9 +189,7 @@ class Recorder:
         table = evaluation_at(step)
         self.tracker.artifact(table, evaluation.table().to_csv().encode())
         self.tracker.artifact(table.replace(".csv", ".txt"), evaluation.report().encode())
-        weights = safetensors.torch.save(
-            {name: tensor.contiguous() for name, tensor in self.learner.evaluated.state_dict().items()}
-        )
+        weights = to_safetensors(self.learner.evaluated.state_dict())
         results = {name: value for name, value in metrics.items() if name.startswith("evaluation/")}
         self.tracker.model(NETWORK, weights, step, results, best=is_best)
         if is_best:

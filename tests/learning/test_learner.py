@@ -615,6 +615,32 @@ def test_other_optimizers_continue_too(optimizer_class: type[torch.optim.Optimiz
     torch.testing.assert_close(unbroken.state_dict(), restored.state_dict(), rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("optimizer_class", [torch.optim.AdamW, torch.optim.RMSprop])
+def test_a_network_with_a_parameter_that_is_one_number_continues(
+    optimizer_class: type[torch.optim.Optimizer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Scaled(DQNCnn):
+        def __init__(self, input_shape: tuple[int, int, int], num_actions: int) -> None:
+            super().__init__(input_shape, num_actions)
+            self.scale = nn.Parameter(torch.tensor(1.0))
+
+        def forward(self, states: torch.Tensor) -> torch.Tensor:
+            return super().forward(states) * self.scale
+
+    monkeypatch.setitem(_SIDE, Scaled, 36)
+
+    def learner(seed: int) -> Learner:
+        network, target = _networks(Scaled, seed)
+        return Learner(network, target, optimizer_class(network.parameters(), lr=1e-3), DQN(), 0.1)  # type: ignore[call-arg]
+
+    before, after = learner(0), learner(10)
+    before.update(*_batch(36))
+    after.load_state_dict(_through_disk(before.state_dict()))
+    before.update(*_batch(36, 1))
+    after.update(*_batch(36, 1))
+    torch.testing.assert_close(before.state_dict(), after.state_dict(), rtol=0, atol=0)
+
+
 @pytest.mark.parametrize("change", ["missing", "shape", "no tensor"])
 def test_an_optimizer_state_that_does_not_fit_is_refused(change: str) -> None:
     learner = _learner(DQNCnn)

@@ -22,8 +22,8 @@ from atlantis_exp.commands.train import VERB
 from atlantis_exp.config import Config, PathsConfig
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.facts import read_facts
-from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import Artifact, Image, Journal, Metrics, Model, read
+from atlantis_exp.runs.folder import RunFolder, find_run
+from atlantis_exp.runs.journal import Artifact, Image, Journal, Metrics, Model, adopt, read
 from atlantis_exp.sessions import verifying
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.reporting import report
@@ -205,6 +205,46 @@ def test_a_damaged_file_of_a_run_is_one_clear_line_and_is_written_anew_once_it_i
     train(Job(tiny(*SHORT)))
     assert json.loads(path.read_bytes()).keys() == whole.keys()
     assert folder.state == "done"
+
+
+def test_a_damaged_run_is_no_obstacle_to_finding_another(tmp_path: Path) -> None:
+    for name, config in (("one", '{"model": {}}'), ("other", "{")):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        (tmp_path / "runs" / name / "config.json").write_text(config)
+    assert {find_run(tmp_path, name).name for name in ("one", "o", "latest")} == {"one"}
+    with pytest.raises(Fault, match=r"other/config\.json is damaged"):
+        find_run(tmp_path, "other")
+
+
+def test_a_run_that_ended_has_its_journal_again_where_its_commit_was_removed(tiny: Compose) -> None:
+    config = tiny(*SHORT)
+    train(Job(config))
+    folder = RunFolder.of(config)
+    before, records = folder.commit, [*folder.records()]
+    assert before is not None
+    with (folder.path / "journal.jsonl").open("a") as file:
+        file.write('{"kind":"metr')  # as a kill leaves a line
+    (folder.path / "commit.json").unlink()
+    adopt(folder.path, folder.path.parents[1] / "sweeps" / "s")  # a sweep of it begins so
+    train(Job(config))
+    after = folder.commit
+    assert after is not None
+    assert (after.offset, after.status, after.labels) == (before.offset, "FINISHED", before.labels)
+    assert [*folder.records()] == records
+    assert folder.state == "done"
+
+
+def test_a_run_without_its_checkpoints_and_its_commit_is_left_as_it_is(tiny: Compose) -> None:
+    config = tiny(*SHORT)
+    train(Job(config), lambda trainer: trainer.counters.steps == 20)
+    folder = RunFolder.of(config)
+    shutil.rmtree(folder.checkpoints)
+    (folder.path / "commit.json").unlink()
+    before = (folder.path / "journal.jsonl").read_bytes()
+    assert before
+    with pytest.raises(Fault, match="its checkpoints are gone"):
+        train(Job(config))
+    assert (folder.path / "journal.jsonl").read_bytes() == before
 
 
 def test_a_damaged_run_is_no_obstacle_to_another(tiny: Compose, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,8 +1,11 @@
+import errno
+import itertools
 import json
 import os
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +14,7 @@ import pytest
 import torch
 
 from atlantis_exp.replay.memory import ReplayMemory, Returns
+from atlantis_exp.runs.files import read_file
 from atlantis_exp.runs.journal import read_commit
 from atlantis_exp.training import checkpoint
 from atlantis_exp.training.checkpoint import FORMAT, CheckpointError, Checkpoints, _checksum
@@ -108,11 +112,58 @@ def test_a_damaged_file_leads_to_the_generation_before_and_is_said(two_generatio
         assert restored(copy)[0] == {"step": 2}
 
 
-def test_a_part_that_the_memory_has_no_room_for_is_damage(
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ESTALE, "Stale file handle"), PermissionError(13, "no"), MemoryError()]
+)
+def test_what_cannot_be_read_now_is_no_damage(
+    two_generations: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    """Else the run would go on without it, and the next commit would remove it."""
+    before = files_of(two_generations)
+    for name in before:
+
+        def refused(path: Path, most: int, name: str = name) -> bytes:
+            if path.match(name):
+                raise error
+            return read_file(path, most)
+
+        if not name.startswith("00000001"):  # which is not read as long as there is a newer one
+            monkeypatch.setattr(checkpoint, "read_file", refused)
+            with pytest.raises(CheckpointError, match=r"cannot be read now \(.+\), but may be whole"):
+                restored(two_generations)
+    monkeypatch.undo()
+    assert files_of(two_generations) == before
+    state, _, said = restored(two_generations)
+    assert state is not None
+    assert (state["step"], said) == (2, [])
+
+
+def test_what_cannot_be_read_now_is_no_damage_either_where_something_else_is(
+    two_generations: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (oldest, *_) = [name for name in files_of(two_generations) if name.startswith("segments/")]
+    (two_generations / oldest).write_bytes(b"")
+    outcomes = []
+    for whole in range(30):
+        files = itertools.count()
+
+        def refused(path: Path, most: int, whole: int = whole, files: Iterator[int] = files) -> bytes:
+            if next(files) >= whole:
+                raise MemoryError
+            return read_file(path, most)
+
+        monkeypatch.setattr(checkpoint, "read_file", refused)
+        with suppress(CheckpointError):
+            outcomes.append(restored(two_generations)[2][-1])
+    assert 0 < len(outcomes) < 30
+    assert {*outcomes} == {"no checkpoint has its whole replay memory: 100 observations are lost, the run goes on"}
+
+
+def test_a_part_that_the_memory_has_no_room_for_is_one_line(
     two_generations: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(checkpoint, "read_file", lambda *_: bytearray(2**62))
-    with pytest.raises(CheckpointError, match="damaged"):
+    with pytest.raises(CheckpointError, match="takes more memory than there is"):
         restored(two_generations)
 
 
