@@ -1,7 +1,7 @@
 """`python -m atlantis_exp compare by=model,sampler`: which group of runs is better, by how much, how surely."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -62,9 +62,13 @@ def margin(delta: str | float | None) -> tuple[float | None, bool]:
 
 def _list_out(arguments: list[str]) -> list[str]:
     """Let a list be written without brackets, as in `by=model,sampler`."""
-    # Hydra itself would take the commas for a sweep, a second `=` for a mistake, and a commit's digits for a number.
-    arguments = [re.sub(r"^baseline=(\d\w*)$", r"baseline='\1'", argument) for argument in arguments]
-    return [re.sub(r"^(by|runs|where)=([^\[].*)$", _listed, argument) for argument in arguments]
+    # Hydra itself would take the commas for a sweep, and a second `=` for a mistake.
+    return [re.sub(r"^(by|runs|where)=([^\[].*)$", _listed, argument) for argument in as_texts(arguments)]
+
+
+def as_texts(arguments: Iterable[str]) -> list[str]:
+    """Arguments with the baseline in quotes, without which Hydra refuses `lr=0.001` and makes a commit a number."""
+    return [re.sub(r"^baseline=(?!null$)([^'\"]+)$", r"baseline='\1'", argument) for argument in arguments]
 
 
 def _listed(match: re.Match[str]) -> str:

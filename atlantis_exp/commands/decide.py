@@ -11,7 +11,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
-from atlantis_exp.commands.compare import margin
+from atlantis_exp.commands.compare import as_texts, margin
 from atlantis_exp.commands.jobs import training_of
 from atlantis_exp.commands.overrides import check, key_of, read_flags, read_override, refuse_twice, swept, values_of
 from atlantis_exp.config import FREE, STRICT, Config
@@ -49,7 +49,7 @@ def _launchers(texts: Iterable[str]) -> list[str]:
 
 def _first_contender(arguments: list[str]) -> list[str]:
     """Leave out the keys that tell contenders apart, and the launcher: what they share is composed, and run here."""
-    texts, is_sweep = read_flags(arguments)
+    texts, is_sweep = read_flags(arguments := as_texts(arguments))
     if is_sweep:
         raise ConfigError("-m: decide plans its own sweeps; drop -m")
     refuse_twice(arguments)
@@ -74,7 +74,8 @@ def request_of(asked: Asked[DecideConfig]) -> "Request":
     from atlantis_exp.comparison.verdict import Question
     from atlantis_exp.sessions.deciding import Request
 
-    config, several = asked.config, swept(asked.typed)
+    config, typed = asked.config, as_texts(asked.typed)
+    several = swept(typed)
     choices = []
     for text in several:
         override = read_override(text)
@@ -91,11 +92,11 @@ def request_of(asked: Asked[DecideConfig]) -> "Request":
     contenders = list(itertools.product(*choices))
     if len(contenders) < 2:
         raise ConfigError("nothing to decide between: give a key several values, as in model=cnn,resnet_fast")
-    texts = read_flags(asked.typed)[0]  # as typed: Hydra has put values in the place of ${...}
+    texts = read_flags(typed)[0]  # as typed: Hydra has put values in the place of ${...}
     launchers = _launchers(texts)
     shared = [text for text in texts if text not in (*several, *launchers)]
     fixed = [text for text in shared if text.lstrip("+~").split("=")[0].split(".")[0] not in _OWN]
-    flags = [text for text in asked.typed if text.startswith("--config-dir=")]
+    flags = [text for text in typed if text.startswith("--config-dir=")]
     launcher = [*flags, *launchers]
     check("config", Config, ["-m", *launcher, *several, *fixed])
     delta, relative = margin(config.delta)

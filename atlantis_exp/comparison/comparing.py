@@ -24,6 +24,7 @@ from atlantis_exp.comparison.gather import (
     plays_alike,
     refuse_mixed_protocols,
     select,
+    shortened,
 )
 from atlantis_exp.comparison.looks import read_looks, write_looks
 from atlantis_exp.comparison.report import page, plain
@@ -85,6 +86,7 @@ def compare(
         none = f": none of {len(gathered.trainings)} has where={','.join(where)}" if gathered.trainings else ""
         raise ConfigError(f"there is no finished training under {outputs / 'runs'} that compare was asked for{none}")
     refuse_mixed_protocols(trainings, question.by)
+    question = replace(question, by=shortened(question.by, trainings))
     groups = group(trainings, question.by)
     asked = families([group_of(members, question.by) for members in groups.values()], question)
 
@@ -95,9 +97,10 @@ def compare(
     identity = {
         **asdict(question),
         "by": list(question.by),
-        "runs": list(runs),
-        "where": list(where),
+        "runs": sorted({*runs}),
+        "where": sorted({*where}),
         "at_epsilon": at_epsilon,
+        "baseline": baseline,
         "groups": [[label, *_recipes(members)] for label, members in groups.items()],
     }
     facts = {**identity, "compared": [training.name for training in trainings]}
@@ -141,7 +144,7 @@ def compare(
                 journal.artifact(f"tables/{name}.parquet", to_parquet(name, table))
             journal.finish()
     _print(comparison)
-    players = [player for player in gathered.players if plays_alike(player, trainings[0])]
+    players = [player for player in gathered.players if plays_alike(player, trainings)]
     _print_film((*trainings, *players))
     print(f"{how_to_open(outputs)}\n{folder.artifact(_PAGE)}")
     if COMMIT in question.by and (worse := worse_than_baseline(comparison.answers, question.by)):
@@ -156,14 +159,23 @@ def worse_than_baseline(answers: Sequence[Answer], by: Sequence[str]) -> list[st
     def others(answer: Answer, value: str) -> set[tuple[str, ...]]:
         return {group.values[:place] + group.values[place + 1 :] for group in answer.family.groups[value]}
 
-    return [
-        f"{verdict.group} by {-verdict.difference:,.0f} points ({-verdict.high:,.0f} to {-verdict.low:,.0f}, "
-        f"{verdict.seeds} seeds each)"
-        for each in answers
-        for verdict in each.decision.verdicts
-        if each.family.plan.baseline is not None and verdict.said == "worse"
-        if others(each, verdict.group) == others(each, verdict.other)
-    ]
+    def commits(answer: Answer, value: str) -> set[str]:
+        return {group.values[place] for group in answer.family.groups[value]}
+
+    base = {commit for each in answers if (name := each.family.plan.baseline) for commit in commits(each, name)}
+    lines = []
+    for each in answers:  # also a family without the baseline, as of the groups behind its average
+        for verdict in each.decision.verdicts:
+            low, high, pair = verdict.low, verdict.high, (verdict.group, verdict.other)
+            if verdict.said == "better":
+                low, high, pair = -high, -low, (verdict.other, verdict.group)
+            of_baseline = commits(each, pair[1]) == base != commits(each, pair[0])
+            if verdict.said in ("better", "worse") and of_baseline and others(each, pair[0]) == others(each, pair[1]):
+                by_points = (
+                    f"{abs(verdict.difference):,.0f} points ({-high:,.0f} to {-low:,.0f}, {verdict.seeds} seeds each)"
+                )
+                lines.append(f"{pair[0]} by {by_points}")
+    return lines
 
 
 def _recipes(runs: Sequence[Training]) -> list[str]:

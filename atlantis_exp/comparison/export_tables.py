@@ -9,7 +9,7 @@ from typing import Any
 
 from atlantis_exp.comparison.gather import AXES
 from atlantis_exp.comparison.published import Row, Table
-from atlantis_exp.comparison.report import COLUMNS, cells, label, number, shown_columns
+from atlantis_exp.comparison.report import COLUMNS, SHARES, cells, label, number, shown_columns
 from atlantis_exp.components import facts_of, known
 
 _FRACTION = "fraction"
@@ -23,15 +23,10 @@ _POINTS = (
     *("later_score", "other_later_score"),
     *(source for game in known("env").values() for source in facts_of(game).sources),
 )
-_FRACTIONS = (
-    *("time_cap_share", "truncated_share", "random_share", "probability", "share", "network", "random"),
-    *("human_normalised_mean", "upper_share", "error", "spent"),
-    *("equal_actions", "equal_by_chance", "equal_where_clear"),
-)
 
 UNITS: Mapping[str, str] = {
     **dict.fromkeys(_POINTS, "points"),
-    **dict.fromkeys(_FRACTIONS, _FRACTION),
+    **dict.fromkeys(sorted(SHARES), _FRACTION),
     "score_per_1000_steps": "points",
     "points_per_frame": "points/frame",
     "points_per_1000_frames": "points/1,000 frames",
@@ -143,7 +138,7 @@ def _cells(name: str, row: Row, table: Table, columns: Iterable[str], known: boo
     """A row as LaTeX without the units that its header has, intervals included, and whether each is a number."""
     missing = {key for key, value in row.items() if _is_missing(value) and not (known and value is None)}
     given = {key: "" if key in missing and key in columns else value for key, value in row.items()}
-    texts = cells(name, given, table) if known else [_cell(given, column) for column in columns]
+    texts = cells(name, given, table) if known else [_cell(name, given, column) for column in columns]
     shown = []
     for column, (text, is_number) in zip(columns, texts, strict=True):
         if column in missing or (not known and column not in row):
@@ -159,11 +154,12 @@ def _cells(name: str, row: Row, table: Table, columns: Iterable[str], known: boo
     return shown
 
 
-def _cell(row: Row, column: str) -> tuple[str, bool]:
+def _cell(name: str, row: Row, column: str) -> tuple[str, bool]:
     value, low, high = (row.get(key) for key in (column, f"{column}_low", f"{column}_high"))
-    text = "" if value is None else number(value, column)
+    as_shown = column if unit(name, column) != _FRACTION else "share"
+    text = "" if value is None else number(value, as_shown)
     if not (_is_missing(low) or _is_missing(high)):
-        text += f" ({number(low, column)} to {number(high, column)})"
+        text += f" ({number(low, as_shown)} to {number(high, as_shown)})"
     return text, isinstance(value, int | float) and not isinstance(value, bool)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atlantis_exp.checking import flatten, to_dict
-from atlantis_exp.comparison.gather import Training, is_of_another, select
+from atlantis_exp.comparison.gather import Training, is_of_another, named_by, select
 from atlantis_exp.components import facts_of, game_of, known
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.episodes import EpisodeTable
@@ -113,7 +113,7 @@ def load_runs(
 
     Args:
         outputs: the folder of `paths.outputs`.
-        runs: starts or patterns of names, as `compare runs=` takes them; none means all.
+        runs: starts or patterns of names, or a decision's name, as `compare runs=` takes them; none means all.
         where: KEY=VALUE of configs, all of which must hold, as `compare where=` takes them. A text is cut at its
             commas.
         points: about how many points of a long curve are read, evenly spaced and with the first and the last; None
@@ -134,9 +134,9 @@ def load_runs(
         skipped[name] = reason
         warnings.warn(f"left out {name}: {reason}", stacklevel=3)
 
-    found = []
+    found, patterns = list[_Run](), named_by(outputs, _listed(runs))
     for folder in all_runs(outputs):
-        if (patterns := _listed(runs)) and not any(fnmatchcase(folder.name, f"{pattern}*") for pattern in patterns):
+        if patterns and not any(fnmatchcase(folder.name, f"{pattern}*") for pattern in patterns):
             continue
         if "~" in folder.name:
             skipped[folder.name] = "put aside by resume=never"
@@ -185,7 +185,8 @@ def _open(folder: RunFolder) -> _Run:
 def _read(run: _Run, points: int) -> None:
     """Fill in all that a run's folder holds. Raises: as _UNREADABLE."""
     folder, facts = run.folder, read_facts(run.folder.path)
-    result, commit, tags = folder.result, folder.commit, facts.tags
+    result = folder.result if folder.state == "done" else None  # a run that was made longer has one still
+    commit, tags = folder.commit, facts.tags
     run.row = {
         **run.config,
         **(_numbers(result) if result else {}),

@@ -65,8 +65,12 @@ class Training:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """All that runs can be told apart by: the config and, where it has no such key, the tags."""
-        return {**self.tags, **self.config}
+        """All that runs can be told apart by: the config and, where it has no such key, the tags.
+
+        The device is the tag's: that which the config's `auto` has become.
+        """
+        device = {key: self.tags[key] for key in ("device",) if key in self.tags}
+        return {**self.tags, **self.config, **device}
 
     @property
     def game(self) -> Component | None:
@@ -131,7 +135,7 @@ def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None
     The name of a decision among `runs` stands for the runs that it rests on. Exported weights are players by their
     latest evaluation.
     """
-    patterns = [pattern for text in runs for pattern in _runs_of_decision(outputs, text) or [text]]
+    patterns = named_by(outputs, runs)
 
     def is_asked_for(name: str) -> bool:
         return not runs or any(fnmatchcase(name, f"{pattern}*") for pattern in patterns)
@@ -153,6 +157,11 @@ def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None
             if is_asked:
                 gathered.skipped[folder.name] = f"{'' if isinstance(error, _Unusable) else 'broken: '}{error}"
     return gathered
+
+
+def named_by(outputs: Path, runs: Iterable[str]) -> list[str]:
+    """The names, their starts and patterns that `runs` is; a decision's name is those of its runs. Raises: Fault."""
+    return [pattern for text in runs for pattern in _runs_of_decision(outputs, text) or [text]]
 
 
 def _runs_of_decision(outputs: Path, name: str) -> list[str]:
@@ -210,6 +219,15 @@ def resolve(key: str, config: Mapping[str, Any]) -> str:
     return next((name for name in (key, f"{key}.name", f"{key}.id") if name in config), "")
 
 
+def shortened(keys: Iterable[str], trainings: Sequence[Training]) -> tuple[str, ...]:
+    """Keys as people call them, each once: `model` for `model.name`."""
+    facts, short = trainings[0].facts, []
+    for key in keys:
+        stem = key.removesuffix(".name").removesuffix(".id")
+        short.append(stem if resolve(stem, facts) == key else key)
+    return tuple(dict.fromkeys(short))
+
+
 def mixed_protocol(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -> tuple[str, str] | None:
     """What of the protocol differs, `game` or a key, and a sentence of it; None where scores mean the same.
 
@@ -254,12 +272,12 @@ def _holders(values: Mapping[str, str]) -> str:
     )
 
 
-def plays_alike(player: Player, training: Training) -> bool:
-    """Whether the game is the same; a crop belongs to a network, and a player without one has no epsilon."""
+def plays_alike(player: Player, trainings: Iterable[Training]) -> bool:
+    """Whether the game of all is the same; a crop belongs to a network, and a player without one has no epsilon."""
     keys = set(PROTOCOL) - {"env.crop"}
     if "weights" not in player.config:
         keys -= {"evaluation.epsilon"}
-    return all(player.config.get(key) == training.config[key] for key in keys)
+    return all(player.config.get(key) == training.config[key] for training in trainings for key in keys)
 
 
 def _check_key(option: str, key: str, trainings: Sequence[Training]) -> None:

@@ -168,14 +168,19 @@ def moved_seeds(facts: Facts) -> Iterator[str]:
 
 
 def unplanned(facts: Facts) -> Iterator[str]:
-    """Looks between the planned ones."""
+    """Looks at other numbers of seeds than the planned ones."""
     for answer in facts.answers:
+        before, planned = 0, answer.family.plan.looks
         for look in answer.decision.looks:
-            if look.size not in answer.family.plan.looks:
-                yield (
-                    f"By {answer.family.name}, a look was taken at {look.size} seeds, where none was planned: it spent "
-                    f"{look.error:.2%} of the error."
+            if look.size not in planned:
+                late = [size for size in planned if before < size < look.size]
+                taken = (
+                    f"the look planned at {late[-1]} seeds was taken at {look.size}"
+                    if late
+                    else f"a look was taken at {look.size} seeds, where none was planned"
                 )
+                yield f"By {answer.family.name}, {taken}: it spent {look.error:.2%} of the error."
+            before = look.size
 
 
 def few_seeds(facts: Facts) -> Iterator[str]:

@@ -160,10 +160,11 @@ EXPLAINED = {
 }
 """What a header's term means, in a sentence."""
 
-_SHARES = {
-    *("time_cap_share", "upper_share", "probability", "network", "random", "human_normalised_mean"),
-    *("error", "spent", "equal_actions", "equal_by_chance", "equal_where_clear"),
+SHARES = {
+    *("time_cap_share", "truncated_share", "random_share", "upper_share", "share", "probability", "network", "random"),
+    *("human_normalised_mean", "error", "spent", "equal_actions", "equal_by_chance", "equal_where_clear"),
 }
+"""The columns that are shares and probabilities, from 0 to 1."""
 _ENDS = {
     ("scores", "score"): ("low", "high"),
     ("scores", "difference"): ("difference_low", "difference_high"),
@@ -221,7 +222,7 @@ def number(value: object, column: str = "") -> str:
         return ""
     if column in ("error", "spent"):
         return f"{value:.2%}"
-    if column in _SHARES:
+    if column in SHARES:
         return f"{value:.1%}"
     if column in ("seed", "epsilon"):
         return str(value)

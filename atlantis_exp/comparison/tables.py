@@ -62,7 +62,7 @@ def compare(
     trainings = [training for runs in groups.values() for training in runs]
     component = trainings[0].game
     game = facts_of(component)
-    players = [player for player in gathered.players if plays_alike(player, trainings[0])]
+    players = [player for player in gathered.players if plays_alike(player, trainings)]
     frames = max((training.curve["frames"][-1] for training in trainings if training.curve), default=0.0)
     by_label = {group.label: group.seeds for group in seeds_of}
     named: list[tuple[str, dict[str, dict[int, float]], Answer | None]] = [

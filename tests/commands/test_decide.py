@@ -34,6 +34,7 @@ Command = Callable[..., int]
         (("optimizer.lr=0.001,1e-3",), "optimizer.lr=0.001: the same contender as optimizer.lr=0.001"),
         (("env.workers=1,2",), "env.workers=2: trains what env.workers=1 trains, under the same name"),
         (("samplers.prioritized.alpha=0.4,0.6",), "samplers.prioritized.alpha=0.6: trains what samplers.prioritized."),
+        (("optimizer.lr=0.001,0.002", "baseline=lr=0.003"), "baseline=lr=0.003: no such group; did you mean 'lr=0.00"),
         (("model=cnn,resnet", "baseline=resnte"), "baseline=resnte: no such group; did you mean 'resnet'?"),
         (
             ("env=atlantis_v0,atlantis_v5",),

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from atlantis_exp.comparison.export_tables import UNITS, to_latex, to_parquet, unit, with_units
 from atlantis_exp.comparison.gather import gather, group
 from atlantis_exp.comparison.published import Table
-from atlantis_exp.comparison.report import COLUMNS, shown_columns
+from atlantis_exp.comparison.report import COLUMNS, SHARES, shown_columns
 from atlantis_exp.comparison.tables import compare
 from atlantis_exp.comparison.verdict import Question
 
@@ -47,6 +47,20 @@ EPISODES = {
     "time_cap_share": 0.125,
     "human_normalised_mean": np.nan,
 }
+
+
+@pytest.mark.parametrize("column", sorted(SHARES))
+@pytest.mark.parametrize("name", ["profile", "any"])
+def test_a_share_is_in_percent_as_its_header_says(name: str, column: str) -> None:
+    header, row = body(to_latex(name, [{"group": "cnn", column: 0.85}]))
+    assert header[1].endswith(r"(\%)")
+    assert row[1] == "85.0"
+
+
+def test_the_ends_of_a_share_s_interval_are_in_percent_too() -> None:
+    header, row = body(to_latex("profile", [{"tau": 1_000.0, "low": 0.25, "high": 0.5}]))
+    assert header[1:] == [r"low (\%)", r"high (\%)"]
+    assert row[1:] == ["25.0", "50.0"]
 
 
 def body(latex: str) -> list[list[str]]:

@@ -181,6 +181,23 @@ def test_a_run_that_goes_on_is_there_with_what_is_committed(recorded: Recorded, 
     assert loaded.evaluations[["step", "final"]].values.tolist() == [[160, False]]
 
 
+def test_a_run_that_is_made_longer_has_no_result_yet(recorded: Recorded, tmp_path: Path) -> None:
+    Journal(recorded("budget.steps=160", outcome="budget")).status("KILLED")
+    loaded = load_runs(tmp_path)
+    assert loaded.runs["state"].tolist() == ["interrupted"]
+    assert "result.steps" not in loaded.runs
+    assert loaded.evaluations[["step", "final"]].values.tolist() == [[160, False]]
+
+
+def test_the_runs_of_a_decision_are_chosen_by_its_name(recorded: Recorded, tmp_path: Path) -> None:
+    run = recorded("seed=1")
+    recorded("seed=2")
+    decision = tmp_path / "decisions" / "decide-x"
+    decision.mkdir(parents=True)
+    (decision / "config.json").write_text(json.dumps({"runs": [run.name]}))
+    assert load_runs(tmp_path, runs="decide-x").runs["seed"].tolist() == [1]
+
+
 def test_what_cannot_be_read_is_named_in_a_warning_and_the_others_are_there(recorded: Recorded, tmp_path: Path) -> None:
     good = recorded("seed=1").name
     broken = {

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from atlantis_exp.comparison.gather import gather, group, refuse_mixed_protocols, select
+from atlantis_exp.comparison.gather import Player, gather, group, plays_alike, refuse_mixed_protocols, select
 from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
@@ -209,6 +209,19 @@ def test_players_are_there_whichever_trainings_are_asked_for(recorded: Recorded,
     (player / "result.json").write_text(json.dumps(result))
     assert len(gather(tmp_path, ["nothing"]).players) == 1
     assert gather(tmp_path, ["nothing"]).trainings == []
+
+
+def test_a_player_is_shown_next_to_runs_whose_game_is_its_own_alone(recorded: Recorded, tmp_path: Path) -> None:
+    still, sticky = (RunFolder(recorded(f"env.sticky={share}")).trained_config.env.sticky for share in ("0.0", "0.25"))
+    gathered = gather(tmp_path)
+    players = [
+        Player("random", {**gathered.trainings[0].config, "env.sticky": each}, gathered.trainings[0].episodes)
+        for each in (still, sticky)
+    ]
+    for player in players:
+        alike = [plays_alike(player, [training]) for training in gathered.trainings]
+        assert sorted(alike) == [False, True]
+        assert not plays_alike(player, gathered.trainings)
 
 
 def test_a_film_is_of_the_episodes_that_count(recorded: Recorded, tmp_path: Path) -> None:

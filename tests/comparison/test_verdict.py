@@ -342,6 +342,19 @@ def test_a_look_that_nobody_planned_is_charged_and_said() -> None:
     assert comparison.tables["plan"][0]["taken"] == "5 7"
 
 
+def test_a_planned_look_that_is_late_is_said_to_be() -> None:
+    runs = [*around("cnn", 3_000.0, range(7)), *around("resnet", 3_015.0, range(7))]
+    said = "By model, the look planned at 5 seeds was taken at 7: it spent 2.45% of the error."
+    assert said in compared(runs).caveats
+
+
+def test_what_would_have_been_found_is_not_said_of_seeds_that_do_not_differ() -> None:
+    runs = [of(model, seed, (2_000.0,) * 4) for model in ("cnn", "resnet") for seed in range(5)]
+    last = compared(runs, seeds=5).verdict
+    assert last.endswith("no group's seeds differ, so what it would have found is unknown.")
+    assert "80 %" not in last
+
+
 def test_a_difference_within_delta_is_a_verdict_too() -> None:
     runs = [*around("cnn", 3_000.0, range(10)), *around("resnet", 3_015.0, range(10))]
     share = compared(runs, delta=0.05, relative=True)
@@ -599,6 +612,51 @@ def test_another_network_of_the_baselines_commit_is_no_worse_commit(
             for folder in record_seeds(model, score, git_commit=commit):
                 folder.rename(folder.with_name(f"{commit[:4]}-{folder.name}"))
     assert "plays better" in run("by=git.commit,model", f"baseline={old[:10]} cnn")
+
+
+@pytest.mark.usefixtures("_undrawn")
+def test_a_commit_that_makes_one_network_worse_is_worse_also_where_another_network_gains(
+    record_seeds: Callable[..., list[Path]], run: Run
+) -> None:
+    old, new = "0123456789abcdef0123456789abcdef01234567", "fedcba9876543210fedcba9876543210fedcba98"
+    for commit, model, score in ((old, "cnn", 3e3), (new, "cnn", 6e3), (old, "resnet", 5e3), (new, "resnet", 3e3)):
+        for folder in record_seeds(model, score, git_commit=commit):
+            folder.rename(folder.with_name(f"{commit[:4]}-{folder.name}"))
+    error = run("by=git.commit,model", f"baseline={old}", code=1)
+    assert error.startswith(f"atlantis_exp: worse than the baseline {old}: {new[:10]} resnet by 2,000 points (1,9")
+    assert error.count("points") == 1
+
+
+@pytest.mark.usefixtures("_undrawn")
+def test_a_question_in_another_order_is_the_same_comparison(
+    record_seeds: Callable[..., list[Path]], run: Run, tmp_path: Path
+) -> None:
+    record_seeds("cnn", 5_000.0)
+    record_seeds("resnet", 3_000.0)
+    run("by=model", "runs=cnn,resnet", "where=env.stack=4,objective=dqn", "baseline=cnn")
+    spent = (the_folder(tmp_path) / "looks.json").read_bytes()
+    run("by=model.name,model", "runs=resnet,cnn,resnet", "where=objective=dqn,env.stack=4", "baseline=cnn")
+    assert (the_folder(tmp_path) / "looks.json").read_bytes() == spent
+
+
+@pytest.mark.usefixtures("_undrawn")
+def test_a_baseline_is_named_as_the_tables_name_it(record_seeds: Callable[..., list[Path]], run: Run) -> None:
+    for alpha, score in ((0.4, 5_000.0), (0.6, 3_000.0)):
+        for folder in record_seeds("cnn", score):
+            config = json.loads((folder / "config.json").read_text())
+            config["samplers"]["prioritized"]["alpha"] = alpha
+            (folder / "config.json").write_text(json.dumps(config))
+    said = run("by=samplers.prioritized.alpha", "baseline=alpha=0.4")
+    assert "alpha=0.6 plays worse than alpha=0.4 by 2,000 points" in said
+
+
+@pytest.mark.usefixtures("_undrawn")
+def test_runs_are_told_apart_by_the_device_that_auto_has_become(
+    record_seeds: Callable[..., list[Path]], run: Run
+) -> None:
+    for device, score in (("cpu", 5_000.0), ("cuda", 3_000.0)):
+        record_seeds("cnn", score, device=device)
+    assert "cpu plays better than cuda by 2,000 points" in run("by=device")
 
 
 @pytest.mark.parametrize(

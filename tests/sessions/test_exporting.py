@@ -157,7 +157,7 @@ def test_exported_weights_score_what_their_card_says(
     assert command("evaluate", *played, "epsilon=0.05", "episodes=2", "evaluation.video=false") == 0
     gathered = gather(trained)
     (training,) = gathered.trainings
-    alike = {player.config["evaluation.epsilon"]: plays_alike(player, training) for player in gathered.players}
+    alike = {player.config["evaluation.epsilon"]: plays_alike(player, [training]) for player in gathered.players}
     assert alike == {0.9: False, 0.05: True}
     assert {player.called for player in gathered.players} == {"weights tiny"}
     comparison = compare(gathered, group(gathered.trainings, ["model"]), Question(["model"]))

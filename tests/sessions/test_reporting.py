@@ -1,5 +1,6 @@
 """The table of results, where there is none yet."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -40,3 +41,17 @@ def test_a_run_that_has_not_ended_has_its_last_evaluation(tmp_path: Path, capsys
     (run.path / "journal.jsonl").write_bytes((run.path / "journal.jsonl").read_bytes().replace(b"{", b"[", 1))
     with pytest.raises(Fault, match=r"^run two: .*byte 0"):
         report(paths=PathsConfig(outputs=str(tmp_path)))
+
+
+def test_a_run_that_is_made_longer_has_its_last_evaluation(
+    recorded: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = recorded("budget.steps=160", outcome="budget")
+    journal = Journal(folder)
+    journal.resume()
+    journal.metrics(dict.fromkeys(EVALUATED, 7_777.0), 500)
+    journal.flush()
+    journal.status("KILLED")
+    report(paths=PathsConfig(outputs=str(tmp_path)))
+    (row,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("│"))
+    assert row.replace("│", "").split()[1:4] == ["500", "(interrupted)", "7,777"]
