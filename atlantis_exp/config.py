@@ -35,7 +35,17 @@ Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Share = Annotated[float, Field(gt=0, lt=1)]
-Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$")]
+
+
+def _check_device(device: str) -> str:
+    if not re.fullmatch(r"auto|cpu|mps|cuda(:\d+)?", device):
+        raise ConfigError(
+            f"device={device}: no such choice; a GPU is cuda or cuda:1 (valid: auto, cpu, mps, cuda, cuda:N)"
+        )
+    return device
+
+
+Device = Annotated[str, AfterValidator(_check_device)]
 
 FREE = frozenset(("plugins", "resume", "device", "threads", "compile", "tracking", "budget", "paths"))
 """The keys that say how a run is done; of `plugins`, those that its components are of are part of what is trained."""

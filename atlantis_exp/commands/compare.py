@@ -72,7 +72,7 @@ def as_texts(arguments: Iterable[str]) -> list[str]:
 
 
 def _listed(match: re.Match[str]) -> str:
-    items = (f"'{item}'" for item in match[2].replace("'", "").split(","))
+    items = (f"'{item}'" for item in re.split(r",(?![^\[]*\])", match[2].replace("'", "")))
     return f"{match[1]}=[{','.join(items)}]"
 
 

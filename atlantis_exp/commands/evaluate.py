@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 from pydantic.dataclasses import dataclass
 
@@ -24,7 +25,8 @@ class EvaluateConfig:
     paths: PathsConfig
 
     def __post_init__(self) -> None:
-        if self.weights not in ("latest", "best") and "/" not in self.weights:
+        is_folder = "/" in self.weights or Path(self.weights, "card.json").exists()
+        if self.weights not in ("latest", "best") and not is_folder:
             raise ConfigError(
                 f"weights={self.weights}: neither a run's nor a folder, as in pretrained/NAME; "
                 f"{nearest(self.weights, ('latest', 'best'))}"

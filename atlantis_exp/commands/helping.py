@@ -1,7 +1,7 @@
 """`--help` of a verb: its keys and groups with the sentences that stand next to them in conf/; loads nothing heavy."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from atlantis_exp.commands import CONF, VERBS
@@ -9,6 +9,7 @@ from atlantis_exp.terminal import PROGRAM
 
 _GROUP = re.compile(r" +- (?P<preset>override /)?(?P<group>[\w@.]+): (?P<option>\w+)\s*(?:#.*)?")
 _KEY = re.compile(r"(?P<indent> *)(?P<key>\w+):(?P<value>.*?)\s*(?:#(?P<comment>.*))?")
+_SHOWN = re.compile(r"  ([\w.]+)(?:=|\s|$)")  # a key as a help shows it
 _VALUES = 30  # columns of a key and its value, behind which its sentence begins
 
 _SWEEP = """\
@@ -34,8 +35,9 @@ def help_text(verb: str, arguments: Sequence[str]) -> str:
         parts.append("\n".join(["== Keys ==", *keys]))
     if groups:
         parts.append("== Groups, chosen by GROUP=OPTION, and the keys of the option that is chosen ==")
+    own = {match[1] for line in keys if (match := _SHOWN.match(line))}
     for group, option in groups.items():
-        parts.append("\n".join(_of_group(group, chosen.get(group, option))))
+        parts.append("\n".join(_without(own, _of_group(group, chosen.get(group, option)))))
     if plugins := _plugins():
         parts.append("\n".join(["== Plugins ==", *plugins]))
     parts.append(f"== Flags ==\n{'' if verb in ('decide', 'search') else _SWEEP}{_FLAGS}")
@@ -50,6 +52,16 @@ def _of_group(name: str, option: str) -> Iterator[str]:
     path = CONF / folder / f"{option}.yaml"
     if not package and path.is_file():
         yield from _keys(path, "" if "@package _global_" in path.read_text("utf-8") else f"{folder}.")
+
+
+def _without(taken: Collection[str], lines: Iterable[str]) -> Iterator[str]:
+    """The lines of a group but for keys that the verb's own file sets, with their sentences."""
+    is_taken = False
+    for line in lines:
+        if match := _SHOWN.match(line):
+            is_taken = match[1] in taken
+        if not is_taken:
+            yield line
 
 
 def _groups(path: Path) -> Iterator[tuple[str, str]]:

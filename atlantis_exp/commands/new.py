@@ -1,5 +1,6 @@
 """`python -m atlantis_exp new model=mynet to=FOLDER`: a package with a component of one's own, to begin with."""
 
+import keyword
 import re
 from collections.abc import Callable
 from functools import partial
@@ -30,6 +31,8 @@ class NewConfig:
                 raise ConfigError(
                     f"{kind}={name}: a name is of small letters, digits and underscores, as in {kind}=mynet"
                 )
+            if keyword.iskeyword(name) or keyword.iskeyword(name.capitalize()):
+                raise ConfigError(f"{kind}={name}: is a word of Python's own; give yours another name")
             if (kind, name) in built_in():
                 raise ConfigError(f"{kind}={name}: is built in and is not replaced; give yours another name")
 

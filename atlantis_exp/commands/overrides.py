@@ -46,6 +46,8 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
     hydras = [override for override in overrides if _is_hydras(override)]
     for override in hydras:
         _refuse_hydras(override)
+        if is_run(arguments):
+            raise ConfigError(f"{override.input_line}: is about the jobs of a sweep; add -m, or leave it out")
     overrides = [override for override in overrides if not _is_hydras(override)]
     admit(next((override.value() for override in overrides if override.key_or_group == "plugins"), []))
     own = config_dir(arguments)
@@ -220,6 +222,10 @@ def values_of(override: Override) -> list[str]:
         values = [*override.sweep_string_iterator()]
     except ValueError as error:  # a range in steps of 0
         raise ConfigError(f"{override.input_line}: {error}") from None
+    except HydraException:
+        raise ConfigError(
+            f"{override.input_line}: no list of values; write them out, or let `search` draw them"
+        ) from None
     if not values:
         raise ConfigError(f"{override.input_line}: there is no value in it")
     return values

@@ -23,6 +23,7 @@ from atlantis_exp.comparison.gather import (
     group,
     plays_alike,
     refuse_mixed_protocols,
+    refuse_unknown,
     select,
     shortened,
 )
@@ -77,6 +78,7 @@ def compare(
         Fault: where commits are compared with a baseline and another one is worse.
     """
     outputs = Path(paths.outputs)
+    refuse_unknown(outputs, runs)
     with terminal.working(f"reading the runs under {outputs}"):
         gathered = gather(outputs, runs, at_epsilon, put_aside=COMMIT in question.by)
     for name, reason in gathered.skipped.items():

@@ -164,6 +164,15 @@ def named_by(outputs: Path, runs: Iterable[str]) -> list[str]:
     return [pattern for text in runs for pattern in _runs_of_decision(outputs, text) or [text]]
 
 
+def refuse_unknown(outputs: Path, runs: Iterable[str]) -> None:
+    """Raise ConfigError where a text of `runs` fits no run that is there."""
+    names = [path.name for path in (outputs / "runs").glob("*") if path.is_dir()]
+    for text in runs if names else ():
+        patterns = named_by(outputs, [text])
+        if not any(fnmatchcase(name, f"{pattern}*") for pattern in patterns for name in names):
+            raise ConfigError(f"runs={text}: no such run under {outputs / 'runs'}; {nearest(text, names)}")
+
+
 def _runs_of_decision(outputs: Path, name: str) -> list[str]:
     """The runs that a decision rests on, none where there is no decision of that name. Raises: Fault."""
     folders = [RunFolder(path) for path in (outputs / "decisions").glob("decide-*") if path.name == name]
@@ -290,6 +299,9 @@ def _is(value: Any, text: str) -> bool:
     if isinstance(value, int | float) and not isinstance(value, bool):
         with suppress(ValueError):
             return float(text) == value
+    if isinstance(value, list):
+        text, value = "".join(text.split()), [*value]
+        return text in (str(value).replace(" ", ""), json.dumps(value, separators=(",", ":")))
     return text in (str(value), json.dumps(value))
 
 

@@ -131,7 +131,7 @@ def _baseline(
         choices = [(name, value, label) for value, label in named.items()]
     else:
         choices = [(name, value, value) for name, values in members for value in values]
-    exact = [(name, label) for name, value, label in choices if value == asked]
+    exact = [(name, label) for name, value, label in choices if asked in (value, value.partition("=")[2])]
     started = {
         (name, label): value
         for name, value, label in choices

@@ -61,9 +61,7 @@ def _undecided(answer: Answer, verdicts: Sequence[Verdict]) -> str:
         return f"{text}; next look at {decision.next_look} seeds{listed}"
     reach = max((verdict.detectable or 0.0 for verdict in verdicts), default=0.0)
     if not reach:
-        return (
-            f"{text}, and there is no further look; no group's seeds differ, so what it would have found is unknown"
-        )
+        return f"{text}, and there is no further look; no group's seeds differ, so what it would have found is unknown"
     return f"{text}, and there is no further look; a difference of {_points(reach)} would have been found with 80 %"
 
 

@@ -15,6 +15,12 @@ from atlantis_exp.commands.composing import composing
 from atlantis_exp.commands.helping import help_text
 
 
+@pytest.mark.parametrize("verb", VERBS)
+def test_no_key_of_a_verb_is_shown_with_two_values(verb: str) -> None:
+    keys = re.findall(r"^  ([a-z_.]+)=", help_text(verb, ()).partition("== Flags")[0], re.MULTILINE)
+    assert len(keys) == len({*keys}) > 0
+
+
 def shown_keys(verb: str, *arguments: str) -> dict[str, str]:
     """The keys of a help and their values; of a preset's the last."""
     return dict(

@@ -3,13 +3,14 @@
 import itertools
 import re
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 
 import pytest
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from atlantis_exp.commands.app import Asked
+from atlantis_exp.commands.check import _work
 from atlantis_exp.commands.jobs import job_of, words_of
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.config import Config
@@ -114,3 +115,11 @@ def test_runs_of_a_group_differ_only_in_their_seed() -> None:
         assert one.title != other.title
         assert one.group != jobs("")[0].group
     assert jobs("")[0].group == "cnn uniform"
+
+
+def test_a_check_does_without_references_that_its_settings_do_not_fit() -> None:
+    for size, others in ((20, []), (84, ["cnn"])):
+        ((overrides, config),) = check("config", Config, ["model=resnet", f"env.size={size}"]).items()
+        call = _work(Asked(config, "check", overrides))
+        assert isinstance(call, partial)
+        assert [each.config.model.name for each in call.args[2]] == others

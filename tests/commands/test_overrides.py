@@ -79,7 +79,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("env.id=Pong-v0", "env.id=Pong-v0", "ALE/Atlantis-v5, Atlantis-v0"),
     ("resume=maybe", "resume=maybe", "auto, must, never"),
     ("objective.target.mode=trian", "objective.target.mode=trian", "'train'"),
-    ("device=gpu", "device=", "auto|cpu|mps|cuda"),
+    ("device=gpu", "device=gpu", "a GPU is cuda"),
     # types and ranges
     ("optimizer.lr=abc", "optimizer.lr", "valid number"),
     ("optimizer.lr=true", "optimizer.lr", "valid number"),
@@ -159,7 +159,9 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("--info everything", "--info", "defaults"),
     # Hydra's own, which name code and places
     ("hydra.foo=1", "hydra.foo=1", "hydra/launcher=NAME"),
-    ("hydra/launcher=lsf", "hydra/launcher", "basic"),
+    ("-m seed=0,1 hydra/launcher=lsf", "hydra/launcher", "basic"),
+    ("hydra/launcher=joblib", "hydra/launcher=joblib", "add -m"),
+    ("search hydra/launcher=basic optimizer=adam,rmsprop", "hydra/launcher=basic", "add -m"),
     ("hydra.mode=MULTIRUN", "hydra.mode=MULTIRUN", "-m"),
     *(
         (f"-m seed=0,1 {text}", text, "hydra/launcher=NAME")
@@ -215,6 +217,8 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("report paths.output=x", "paths.output", "'paths.outputs'"),
     ("new component.model=cnn to=x", "model=cnn", "built in"),
     ("new component.model=MyNet to=x", "model=MyNet", "small letters"),
+    ("new component.model=none to=x", "model=none", "Python's own"),
+    ("new component.model=class to=x", "model=class", "Python's own"),
     ("ui port=80", "port=80", "greater than or equal to 1024"),
 ]
 
@@ -241,6 +245,8 @@ def test_a_plugin_of_an_unknown_user_is_one_line_before_hydra_reads_it() -> None
     ("line", "reason"),
     [
         ("seed=range(0)", "seed=range(0): there is no value in it"),
+        ("optimizer.lr=interval(0,1)", "optimizer.lr=interval(0,1): no list of values; write them out"),
+        ("model=glob(*)", "model=glob(*): no list of values; write them out"),
         ("seed=range(0,1,0)", "seed=range(0,1,0): range() arg 3 must not be zero"),
         ("hydra/launcher=null", "hydra/launcher=null: of Hydra's own, hydra/launcher=NAME"),
         ("hydra/launcher=joblib hydra.launcher.n_jobs=0", "hydra.launcher.n_jobs=0: should be how many jobs at a time"),

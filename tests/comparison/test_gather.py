@@ -255,6 +255,9 @@ def test_runs_are_chosen_by_name_and_by_config(recorded: Recorded, tmp_path: Pat
     assert (
         len(select(everything, [f"optimizer.lr={rate:.9f}", f"optimizer.lr={rate:.9e}", "replay.capacity=1_20"])) == 4
     )
+    crop = everything[0].config["env.crop"]
+    for text in (str(crop), json.dumps(crop, separators=(",", ":"))):
+        assert len(select(everything, [f"env.crop={text}"])) == 4
     with pytest.raises(ConfigError, match="where=modle: no such key"):
         select(everything, ["modle=cnn"])
     with pytest.raises(ConfigError, match="write KEY=VALUE"):

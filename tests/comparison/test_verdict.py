@@ -648,6 +648,7 @@ def test_a_baseline_is_named_as_the_tables_name_it(record_seeds: Callable[..., l
             (folder / "config.json").write_text(json.dumps(config))
     said = run("by=samplers.prioritized.alpha", "baseline=alpha=0.4")
     assert "alpha=0.6 plays worse than alpha=0.4 by 2,000 points" in said
+    assert "alpha=0.6 plays worse than alpha=0.4" in run("by=samplers.prioritized.alpha", "baseline=0.4")
 
 
 @pytest.mark.usefixtures("_undrawn")
@@ -665,6 +666,8 @@ def test_runs_are_told_apart_by_the_device_that_auto_has_become(
         ("baseline=cnm", "baseline=cnm: there is one group only"),
         ("delta=-5%", "delta=-5%: write a share of a score, as in delta=5%, or points, as in delta=500"),
         ("delta=0", "delta=0: write"),
+        ("runs=cnn,resnt", "runs=resnt: no such run under "),
+        ("where=env.crop=[1,2,3,4],model=cnn", "there is no finished training under "),
         ("seeds=4", "seeds=4: should be greater than or equal to 5"),
         ("error=1", "error=1: should be less than 1"),
         ("look=later", "look=later: no such choice; no valid choice is near (valid: due, now)"),
