@@ -208,7 +208,7 @@ class Checkpoints:
         except OSError as error:
             if error.errno in _FOR_GOOD:
                 raise
-            raise self._not_now(error.strerror) from error
+            raise self._not_now(str(error)) from error
 
     def _not_now(self, reason: str) -> CheckpointError:
         return CheckpointError(

@@ -29,7 +29,7 @@ Batch = tuple[
     npt.NDArray[np.float32],
 ]
 
-_SIDE = {DQNCnn: 36, ResNetDQN: 31}  # pixels; small, since the tests are about the learner
+_SIDE: dict[type[nn.Module], int] = {DQNCnn: 36, ResNetDQN: 31}  # pixels; small, since the tests are about the learner
 every_network = pytest.mark.parametrize("network_class", [DQNCnn, ResNetDQN])
 every_precision = pytest.mark.parametrize("precision", ["fp32", "bf16"])
 
