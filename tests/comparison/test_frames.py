@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+import time
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -121,6 +122,7 @@ def test_evaluations_of_one_step_are_in_the_order_in_which_they_were_made_and_th
 ) -> None:
     name = recorded(scores=(300.0,)).name
     evaluated(tmp_path, name, 5.0, name="z made first")
+    time.sleep(0.002)  # times are in ms
     evaluated(tmp_path, name, 6.0, name="a made last")
     evaluated(tmp_path, name, 4.0, name="of the middle", step=80)
     evaluated(tmp_path, "another run", 1.0, name="of a run that is not here")

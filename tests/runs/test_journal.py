@@ -462,8 +462,8 @@ def test_the_null_journal_has_the_journals_interface(tmp_path: Path) -> None:
         wanted = inspect.signature(getattr(Tracker, name))
         for tracker in trackers:
             assert inspect.signature(getattr(type(tracker), name)) == wanted, (tracker, name)
-    without_checkpoints = {"resume", "flush", "finish"}  # for writers that are no training
-    assert {name for name in vars(Journal) if name[0] != "_"} == set(public) | without_checkpoints
+    of_others = {"resume", "flush", "finish", "recover"}  # than a training that goes on
+    assert {name for name in vars(Journal) if name[0] != "_"} == set(public) | of_others
 
 
 def test_the_null_journal_accepts_everything_and_remembers_nothing() -> None:
