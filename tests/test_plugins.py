@@ -328,8 +328,8 @@ BROKEN = [  # what is in mynet.py instead of a part of it, the line that is to b
     ("self.features = ", "self.features = nn.Conv3d() or ", "Conv3d", r"TypeError: .* missing 3 required"),
     ("flatten(1)", "flatten()", "flatten()", r"RuntimeError: mat1 and mat2"),
     (
-        "self.head(self",
-        "(self",
+        "self.head((x",
+        "((x",
         "class MyNet",
         r"TypeError: MyNet returns \(2, 200\) for two states; it should be \(2, 4\)",
     ),

@@ -260,8 +260,9 @@ def test_the_three_networks_in_bfloat16_are_set_side_by_side_as_their_runs_are()
     pairs = [*zip(played["ResNetDQN"], played["DQNCnn"], strict=False)]  # of equal seeds
     assert all(residual.scores.mean() < plain.scores.mean() for residual, plain in pairs)
     all_of, same = (listed([f"{mean:,.0f}" for mean in means[network]]) for network in ("ResNetDQN", "DQNCnn"))
-    assert f"ResNetDQN {all_of}" in readme
-    assert f"with the same seeds DQNCnn {same}, with the first one's ResNetFast {means['ResNetFast'][0]:,.0f}" in readme
+    assert f"ResNetDQN has {all_of} points" in readme
+    assert f"DQNCnn, which has {same} with the same seeds;" in readme
+    assert f"ResNetFast has {means['ResNetFast'][0]:,.0f} with the first one" in readme
     assert f"ResNetDQN scores {all_of} by the recipe" in results
     assert f"which has {same} with the same seeds." in results
     scores = np.concatenate([games.scores for games in played["ResNetDQN"]])

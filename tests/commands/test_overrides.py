@@ -161,7 +161,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("hydra.foo=1", "hydra.foo=1", "hydra/launcher=NAME"),
     ("-m seed=0,1 hydra/launcher=lsf", "hydra/launcher", "basic"),
     ("hydra/launcher=joblib", "hydra/launcher=joblib", "add -m"),
-    ("search hydra/launcher=basic optimizer=adam,rmsprop", "hydra/launcher=basic", "add -m"),
+    ("search hydra/launcher=basic", "hydra/launcher=basic", "add -m"),
     ("hydra.mode=MULTIRUN", "hydra.mode=MULTIRUN", "-m"),
     *(
         (f"-m seed=0,1 {text}", text, "hydra/launcher=NAME")
