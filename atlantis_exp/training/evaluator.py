@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.vector import Emulators
 from atlantis_exp.training.actor import Actor
-from atlantis_exp.training.evaluation import Evaluation, evaluate
+from atlantis_exp.training.evaluation import Evaluation, Stopped, evaluate
 from atlantis_exp.training.film import Part, film_episode
 from atlantis_exp.training.progress import Progress
 
@@ -52,8 +52,20 @@ class Evaluator:
                 stop=stop,
             )
 
-    def film(self, evaluation: Evaluation, progress: Progress) -> bytes | None:
-        """An mp4 of the best episode; None where there is to be none."""
+    def film(
+        self, evaluation: Evaluation, progress: Progress, stop: Callable[[], bool] = lambda: False
+    ) -> bytes | None:
+        """An mp4 of the best episode; None where there is to be none.
+
+        Raises:
+            Stopped: when `stop`, which is asked before every picture, says so.
+        """
         if self.video is None:
             return None
-        return film_episode(evaluation.best, self.make_emulator(), self.video, progress.filming)
+
+        def tell(drawn: int, pictures: int) -> None:
+            if stop():
+                raise Stopped
+            progress.filming(drawn, pictures)
+
+        return film_episode(evaluation.best, self.make_emulator(), self.video, tell)

@@ -25,8 +25,8 @@ from atlantis_exp.training.progress import Pace, Progress, Snapshot
 Stop = Callable[[], bool]
 Evaluate = Callable[[int, Progress, Stop], Evaluation]
 """Plays so many episodes. Raises: Stopped."""
-Film = Callable[[Evaluation, Progress], bytes | None]
-"""An mp4 of an evaluation's best episode, if there is to be one."""
+Film = Callable[[Evaluation, Progress, Stop], bytes | None]
+"""An mp4 of an evaluation's best episode, if there is to be one. Raises: Stopped."""
 
 
 class Played(NamedTuple):
@@ -175,7 +175,7 @@ class Recorder:
             with self._pace.paused():
                 evaluation = self._evaluate(episodes, self.progress, stop)
                 is_best = evaluation.summary.mean > self.best_mean
-                video = self._film(evaluation, self.progress) if is_best else None
+                video = self._film(evaluation, self.progress, stop) if is_best else None
         except Stopped:
             return
         self.evaluation_pending = False

@@ -3,18 +3,21 @@
 import io
 from array import array
 from collections.abc import Callable
+from itertools import count
 from typing import get_args
 
 import av
 import numpy as np
 import pytest
+from rich.console import Console
 
-from atlantis_exp.build import build_emulators, build_learner, make_emulator
+from atlantis_exp.build import build_emulators, build_evaluator, build_learner, make_emulator
 from atlantis_exp.config import Config
 from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.training.actor import Actor, EpsilonGreedy, RandomActor
-from atlantis_exp.training.evaluation import Episode, evaluate
+from atlantis_exp.training.evaluation import Episode, Stopped, evaluate
 from atlantis_exp.training.film import Part, film_episode, moments, span
+from atlantis_exp.training.progress import Progress
 
 Compose = Callable[..., Config]
 
@@ -91,3 +94,13 @@ def test_a_film_of_a_part_shows_that_part_and_says_how_far_it_is(tiny: Compose, 
     assert told == [(index, 5) for index in range(6)]
     with av.open(io.BytesIO(content), "r") as container:
         assert len(list(container.decode(video=0))) == 6
+
+
+def test_a_film_is_given_up_once_that_is_asked_for(tiny: Compose) -> None:
+    config, progress, asked = tiny("env.max_steps=25", "evaluation.video=all"), Progress(Console(quiet=True)), count()
+    evaluator = build_evaluator(config.env, config.evaluation)
+    played = evaluator(RandomActor(4), 2, progress)
+    with pytest.raises(Stopped):
+        evaluator.film(played, progress, lambda: next(asked) == 3)
+    assert next(asked) == 4
+    assert evaluator.film(played, progress)
