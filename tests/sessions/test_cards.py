@@ -13,7 +13,10 @@ import safetensors.torch
 
 from atlantis_exp.build import build_network
 from atlantis_exp.checking import parse, to_dict
+from atlantis_exp.commands.evaluate import EvaluateConfig
+from atlantis_exp.commands.overrides import check
 from atlantis_exp.config import Config
+from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.cards import Card, pack, portable
 
 Command = Callable[..., int]
@@ -116,6 +119,14 @@ def test_a_misspelt_folder_and_a_run_beside_a_folder_are_one_line(
     assert f"did you mean '{folder}'?" in capsys.readouterr().err
     assert command("evaluate", f"weights={folder}", "run=latest", outputs) == 2
     assert capsys.readouterr().err.startswith("atlantis_exp: run=latest: ")
+
+
+def test_a_folder_of_this_place_is_named_without_a_path(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder.parent)
+    ((_, config),) = check("evaluate", EvaluateConfig, ["weights=untrained"]).items()
+    assert config.weights == "untrained"
+    with pytest.raises(ConfigError, match="weights=untraind: neither"):
+        check("evaluate", EvaluateConfig, ["weights=untraind"])
 
 
 def test_weights_are_packed_in_half_precision_only_above_eight_megabytes() -> None:
