@@ -69,7 +69,7 @@ class Training:
 
         The device is the tag's: that which the config's `auto` has become.
         """
-        device = {key: self.tags[key] for key in ("device",) if key in self.tags}
+        device = {key: value for key, value in self.tags.items() if key == "device"}
         return {**self.tags, **self.config, **device}
 
     @property
@@ -300,8 +300,7 @@ def _is(value: Any, text: str) -> bool:
         with suppress(ValueError):
             return float(text) == value
     if isinstance(value, list):
-        text, value = "".join(text.split()), [*value]
-        return text in (str(value).replace(" ", ""), json.dumps(value, separators=(",", ":")))
+        return "".join(text.split()) in (str(value).replace(" ", ""), json.dumps(value, separators=(",", ":")))
     return text in (str(value), json.dumps(value))
 
 
