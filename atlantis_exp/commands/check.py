@@ -26,8 +26,9 @@ def _work(asked: Asked[Config]) -> Callable[[], None]:
     own = [text for text in asked.overrides if not text.startswith("model")]
     others = []
     for text in references:
-        with suppress(ConfigError):  # these settings may be none for a network that nobody asked about
-            others += [training_of([*own, text])] if text not in asked.overrides else []
+        if text not in asked.overrides:
+            with suppress(ConfigError):  # these settings may be none for a network that nobody asked about
+                others.append(training_of([*own, text]))
     return partial(check, job_of(asked), training_of(replaced(chosen, *_SMALL)), others)
 
 

@@ -168,15 +168,19 @@ def worse_than_baseline(answers: Sequence[Answer], by: Sequence[str]) -> list[st
     lines = []
     for each in answers:  # also a family without the baseline, as of the groups behind its average
         for verdict in each.decision.verdicts:
-            low, high, pair = verdict.low, verdict.high, (verdict.group, verdict.other)
-            if verdict.said == "better":
-                low, high, pair = -high, -low, (verdict.other, verdict.group)
-            of_baseline = commits(each, pair[1]) == base != commits(each, pair[0])
-            if verdict.said in ("better", "worse") and of_baseline and others(each, pair[0]) == others(each, pair[1]):
-                by_points = (
-                    f"{abs(verdict.difference):,.0f} points ({-high:,.0f} to {-low:,.0f}, {verdict.seeds} seeds each)"
+            match verdict.said:
+                case "worse":
+                    worse, better, low, high = verdict.group, verdict.other, -verdict.high, -verdict.low
+                case "better":
+                    worse, better, low, high = verdict.other, verdict.group, verdict.low, verdict.high
+                case _:
+                    continue
+            is_of_baseline = commits(each, better) == base and commits(each, worse) != base
+            if is_of_baseline and others(each, worse) == others(each, better):
+                lines.append(
+                    f"{worse} by {abs(verdict.difference):,.0f} points ({low:,.0f} to {high:,.0f}, "
+                    f"{verdict.seeds} seeds each)"
                 )
-                lines.append(f"{pair[0]} by {by_points}")
     return lines
 
 

@@ -7,7 +7,6 @@ import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -15,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atlantis_exp.checking import flatten, to_dict
-from atlantis_exp.comparison.gather import Training, is_of_another, named_by, select
+from atlantis_exp.comparison.gather import Training, fits, is_of_another, named_by, select
 from atlantis_exp.components import facts_of, game_of, known
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.episodes import EpisodeTable
@@ -136,7 +135,7 @@ def load_runs(
 
     found, patterns = list[_Run](), named_by(outputs, _listed(runs))
     for folder in all_runs(outputs):
-        if patterns and not any(fnmatchcase(folder.name, f"{pattern}*") for pattern in patterns):
+        if patterns and not fits(folder.name, patterns):
             continue
         if "~" in folder.name:
             skipped[folder.name] = "put aside by resume=never"
@@ -185,8 +184,7 @@ def _open(folder: RunFolder) -> _Run:
 def _read(run: _Run, points: int) -> None:
     """Fill in all that a run's folder holds. Raises: as _UNREADABLE."""
     folder, facts = run.folder, read_facts(run.folder.path)
-    result = folder.result if folder.state == "done" else None  # a run that was made longer has one still
-    commit, tags = folder.commit, facts.tags
+    result, commit, tags = folder.final_result, folder.commit, facts.tags
     run.row = {
         **run.config,
         **(_numbers(result) if result else {}),

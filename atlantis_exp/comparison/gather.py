@@ -138,7 +138,7 @@ def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None
     patterns = named_by(outputs, runs)
 
     def is_asked_for(name: str) -> bool:
-        return not runs or any(fnmatchcase(name, f"{pattern}*") for pattern in patterns)
+        return not runs or fits(name, patterns)
 
     gathered = Gathered()
     evaluations, exported = _evaluations(outputs, gathered.skipped)
@@ -164,12 +164,17 @@ def named_by(outputs: Path, runs: Iterable[str]) -> list[str]:
     return [pattern for text in runs for pattern in _runs_of_decision(outputs, text) or [text]]
 
 
+def fits(name: str, patterns: Iterable[str]) -> bool:
+    """Whether a run's name begins with or fits one of the patterns."""
+    return any(fnmatchcase(name, f"{pattern}*") for pattern in patterns)
+
+
 def refuse_unknown(outputs: Path, runs: Iterable[str]) -> None:
     """Raise ConfigError where a text of `runs` fits no run that is there."""
     names = [path.name for path in (outputs / "runs").glob("*") if path.is_dir()]
     for text in runs if names else ():
         patterns = named_by(outputs, [text])
-        if not any(fnmatchcase(name, f"{pattern}*") for pattern in patterns for name in names):
+        if not any(fits(name, patterns) for name in names):
             raise ConfigError(f"runs={text}: no such run under {outputs / 'runs'}; {nearest(text, names)}")
 
 

@@ -112,6 +112,11 @@ class RunFolder:
         """How the run ended, None before its end."""
         return _read(self.path / RESULT, Result)
 
+    @property
+    def final_result(self) -> Result | None:
+        """How the run ended; None also while it is being made longer, when `result` is of its end before."""
+        return self.result if self.state == "done" else None
+
     def ended(self, budget: int | None) -> Result | None:
         """How the run has ended, None if it goes on: it has not, or did by its budget of steps and has now a larger."""
         if not self.has_started or (result := self.result) is None:

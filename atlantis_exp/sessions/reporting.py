@@ -26,7 +26,7 @@ def report(*, paths: PathsConfig) -> None:
     table = Table(*columns, title=f"last evaluations of the runs in {shown}")
     for column in table.columns[1:]:
         column.justify = "right"
-    results = [run.result if run.state == "done" else None for run in runs]
+    results = [run.final_result for run in runs]
     for run, result in zip(runs, results, strict=True):
         if result is not None:
             earlier = f" (evaluated at {result.evaluated_at:,})" if result.evaluated_at is not None else ""

@@ -1,12 +1,10 @@
 """The weights that a stored run has: of its last commit, or of its best evaluation as of that commit."""
 
-import safetensors.torch
-
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import ARTIFACT, is_whole, read_file
 from atlantis_exp.runs.folder import NETWORK, RunFolder
 from atlantis_exp.runs.journal import Model, model_file
-from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints, unforged
+from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints, to_safetensors, unforged
 
 
 def stored_weights(run: RunFolder, weights: str) -> tuple[bytes, int]:
@@ -30,7 +28,7 @@ def stored_weights(run: RunFolder, weights: str) -> tuple[bytes, int]:
     with unforged(run.checkpoints):
         if weights == "latest":
             learner = state["learner"]
-            return safetensors.torch.save(learner.get("evaluated", learner["network"])), int(state["counters"]["steps"])
+            return to_safetensors(learner.get("evaluated", learner["network"])), int(state["counters"]["steps"])
         step = int(state["best_step"])
     if step < 0:
         raise Fault(f"run {run.name} has no evaluation yet, so no best weights; weights=latest has some")

@@ -47,10 +47,15 @@ def unforged(folder: Path) -> Iterator[None]:
 
 
 def to_safetensors(tensors: Mapping[str, torch.Tensor]) -> bytes:
-    """Tensors by name as safetensors."""
-    # Of copies, since it refuses what shares memory, as tied weights do.
-    copies = {name: tensor.detach().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()}
-    return safetensors.torch.save(copies)
+    """Tensors by name as safetensors, which refuses what shares memory: of tied weights each is written."""
+    written: dict[str, torch.Tensor] = {}
+    places: set[int] = set()
+    for name, tensor in tensors.items():
+        place = tensor.untyped_storage().data_ptr()
+        apart = tensor.detach().clone() if place in places else tensor.detach()
+        written[name] = apart.contiguous()
+        places.add(place)
+    return safetensors.torch.save(written)
 
 
 class Checkpoints:

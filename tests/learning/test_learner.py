@@ -29,7 +29,23 @@ Batch = tuple[
     npt.NDArray[np.float32],
 ]
 
-_SIDE: dict[type[nn.Module], int] = {DQNCnn: 36, ResNetDQN: 31}  # pixels; small, since the tests are about the learner
+
+class Scaled(DQNCnn):
+    """A network with a parameter that is one number."""
+
+    def __init__(self, input_shape: tuple[int, int, int], num_actions: int) -> None:
+        super().__init__(input_shape, num_actions)
+        self.scale = nn.Parameter(torch.tensor(1.0))
+
+    def forward(self, states: torch.Tensor) -> torch.Tensor:
+        return super().forward(states) * self.scale
+
+
+_SIDE: dict[type[nn.Module], int] = {
+    DQNCnn: 36,
+    Scaled: 36,
+    ResNetDQN: 31,
+}  # pixels; small, since the tests are about the learner
 every_network = pytest.mark.parametrize("network_class", [DQNCnn, ResNetDQN])
 every_precision = pytest.mark.parametrize("precision", ["fp32", "bf16"])
 
@@ -600,10 +616,18 @@ def test_a_loaded_state_stays_the_caller_s() -> None:
     torch.testing.assert_close(state, before, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("optimizer_class", [torch.optim.Adam, torch.optim.RMSprop])
-def test_other_optimizers_continue_too(optimizer_class: type[torch.optim.Optimizer]) -> None:
+@pytest.mark.parametrize(
+    ("network_class", "optimizer_class"),
+    [
+        *((DQNCnn, optimizer_class) for optimizer_class in (torch.optim.Adam, torch.optim.RMSprop)),
+        *((Scaled, optimizer_class) for optimizer_class in (torch.optim.AdamW, torch.optim.RMSprop)),
+    ],
+)
+def test_other_optimizers_and_networks_continue_too(
+    network_class: type[nn.Module], optimizer_class: type[torch.optim.Optimizer]
+) -> None:
     def learner(seed: int) -> Learner:
-        network, target = _networks(DQNCnn, seed)
+        network, target = _networks(network_class, seed)
         optimizer = optimizer_class(network.parameters(), lr=1e-3)  # type: ignore[call-arg]
         return Learner(network, target, optimizer, DQN(), 0.1)
 
@@ -613,32 +637,6 @@ def test_other_optimizers_continue_too(optimizer_class: type[torch.optim.Optimiz
     unbroken.update(*_batch(36, 1))
     restored.update(*_batch(36, 1))
     torch.testing.assert_close(unbroken.state_dict(), restored.state_dict(), rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("optimizer_class", [torch.optim.AdamW, torch.optim.RMSprop])
-def test_a_network_with_a_parameter_that_is_one_number_continues(
-    optimizer_class: type[torch.optim.Optimizer], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Scaled(DQNCnn):
-        def __init__(self, input_shape: tuple[int, int, int], num_actions: int) -> None:
-            super().__init__(input_shape, num_actions)
-            self.scale = nn.Parameter(torch.tensor(1.0))
-
-        def forward(self, states: torch.Tensor) -> torch.Tensor:
-            return super().forward(states) * self.scale
-
-    monkeypatch.setitem(_SIDE, Scaled, 36)
-
-    def learner(seed: int) -> Learner:
-        network, target = _networks(Scaled, seed)
-        return Learner(network, target, optimizer_class(network.parameters(), lr=1e-3), DQN(), 0.1)  # type: ignore[call-arg]
-
-    before, after = learner(0), learner(10)
-    before.update(*_batch(36))
-    after.load_state_dict(_through_disk(before.state_dict()))
-    before.update(*_batch(36, 1))
-    after.update(*_batch(36, 1))
-    torch.testing.assert_close(before.state_dict(), after.state_dict(), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("change", ["missing", "shape", "no tensor"])
