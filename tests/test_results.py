@@ -302,6 +302,19 @@ def test_what_top_half_scores_is_said_as_its_games_say_it() -> None:
         assert f"average {np.mean(top):,.0f} points with it and {np.mean(same):,.0f} without" in text
 
 
+def test_the_trainings_on_a_gpu_stand_next_to_the_uniform_ones_of_their_seeds() -> None:
+    with (DOCS / "data" / "top_half_on_a_gpu.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["kind"] == "evaluation" and row["step"] == "1000000"]
+    uniform = of_the_verdict("uniform", "resnet_fast")
+    assert rows
+    for row in rows:
+        games = evaluated(uniform[int(row["seed"])])
+        assert (
+            f"| {row['seed']} | {games.scores.mean():,.0f} ({interquartile_mean(games.scores):,.0f}) | "
+            f"{float(row['mean']):,.0f} ({float(row['interquartile_mean']):,.0f}) |"
+        ) in RESULTS.read_text()
+
+
 def test_published_curves_are_quoted_as_they_are() -> None:
     text = " ".join(RESULTS.read_text().split())
     means = {(row["name"], row["frames"]): row["mean"] for row in curves(game_of("Atlantis-v0"))}
