@@ -1,5 +1,6 @@
 """The weights that come with the repository: each folder is what its card says."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,15 @@ def test_a_folder_is_what_its_card_says(folder: Path) -> None:
     values = actor.q_values(np.zeros((2, env.stack, env.size, env.size), np.uint8))
     assert values.shape == (2, 4)
     assert np.isfinite(values).all()
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_the_readme_says_what_a_folder_scores(folder: Path) -> None:
+    card, _ = read_card(folder)
+    readme = " ".join((REPOSITORY / "README.md").read_text().split())
+    about = readme.split(f"`pretrained/{folder.name}` is ")[1].split("`pretrained/")[0]
+    scores = re.findall(r"([\d,]+) over (\d+)", about)
+    assert (f"{np.mean(card.scores):,.0f}", str(len(card.scores))) in scores
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)

@@ -37,7 +37,7 @@ class Card:
     weights: Literal["latest", "best"]
     step: Annotated[int, Field(ge=0)]  # of the training
     reached: dict[str, float]  # episodes, frames, updates and hours, at the last point of the curve until then
-    made: dict[str, str]  # command, commit and versions of the training's last session
+    made: dict[str, str]  # command, precision, commit and versions of the training's last session
     precision: Literal["float32", "float16"]
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]  # of weights.safetensors
     config: Config
@@ -174,6 +174,8 @@ def _page(folder: Path, card: Card, files: str, evaluation: Evaluation) -> str:
     }
     place = folder if len(folder.parts) > 1 and not folder.is_absolute() else f"./{folder.name}"
     what = f"{card.config.model.name} with {card.config.objective.name}"
+    learned = card.made.get("precision", "float32")
+    otherwise = "" if learned == "float32" else f"; it learned in {learned}, in which it may choose otherwise"
     return f"""{metadata(folder.name, card)}
 
 # {folder.name}
@@ -189,7 +191,7 @@ Weights of a network that plays Atari {card.config.env.title}: {what}.
 |{" ---: |" * len(_COLUMNS)}
 | {" | ".join(_points(card.evaluation, card.scores))} |
 
-Played with the weights of this folder, in float32. The interval is the bootstrap's 95 % of the mean over these
+Played with the weights of this folder, in float32{otherwise}. The interval is the bootstrap's 95 % of the mean over these
 episodes; it says nothing of trainings with other seeds. The network's policy: {evaluation.policy}.
 
     {evaluation.report().replace(chr(10), chr(10) + "    ")}

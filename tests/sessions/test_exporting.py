@@ -112,6 +112,17 @@ def test_weights_that_no_training_can_begin_with_are_one_line_and_leave_nothing(
     assert "card.json" in refused(f"training.weights={exported}")
 
 
+@pytest.mark.parametrize(("precision", "said"), [("fp32", ". "), ("bf16", "; it learned in bfloat16, in which it may ")])
+def test_a_page_says_that_a_network_learned_in_another_precision_than_it_plays_in(
+    command: Command, tiny: Compose, tmp_path: Path, precision: str, said: str
+) -> None:
+    config = tiny(f"training.precision={precision}", "env.max_steps=200")
+    train(Job(config))
+    folder = tmp_path / "pretrained" / "tiny"
+    assert command("export", f"to={folder}", "episodes=1", f"paths.outputs={config.paths.outputs}", "device=cpu") == 0
+    assert f"with the weights of this folder, in float32{said}" in (folder / "README.md").read_text()
+
+
 def test_exported_weights_score_what_their_card_says(
     command: Command, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
