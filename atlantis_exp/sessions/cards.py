@@ -191,8 +191,9 @@ Weights of a network that plays Atari {card.config.env.title}: {what}.
 |{" ---: |" * len(_COLUMNS)}
 | {" | ".join(_points(card.evaluation, card.scores))} |
 
-Played with the weights of this folder, in float32{otherwise}. The interval is the bootstrap's 95 % of the mean over these
-episodes; it says nothing of trainings with other seeds. The network's policy: {evaluation.policy}.
+Played with the weights of this folder, in float32{otherwise}.
+The interval is the bootstrap's 95 % of the mean over these episodes; it says nothing of
+trainings with other seeds. The network's policy: {evaluation.policy}.
 
     {evaluation.report().replace(chr(10), chr(10) + "    ")}
 

@@ -83,7 +83,7 @@ def _history(run: RunFolder, step: int) -> tuple[dict[str, float], dict[str, str
             tags |= record.values
         elif isinstance(record, Metrics) and record.values.keys() >= {*_COUNTERS} and record.step <= step:
             reached = {name.split("/")[1]: record.values[name] for name in _COUNTERS}
-    made = {key: value for key, value in tags.items() if key in ("command", "precision") or key.startswith(("git.", "version."))}
+    made = {key: value for key, value in tags.items() if key.startswith(("command", "git.", "precision", "version."))}
     if "command" in made:  # without the places of this machine
         made["command"] = re.sub(r" (paths|tracking)\.\S+", "", made["command"])
         made["command"] = re.sub(r"/[^,'\]\[]*/(?=\w+\.py\b)", "./", made["command"])  # of plugins

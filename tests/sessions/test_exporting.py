@@ -112,7 +112,9 @@ def test_weights_that_no_training_can_begin_with_are_one_line_and_leave_nothing(
     assert "card.json" in refused(f"training.weights={exported}")
 
 
-@pytest.mark.parametrize(("precision", "said"), [("fp32", ". "), ("bf16", "; it learned in bfloat16, in which it may ")])
+@pytest.mark.parametrize(
+    ("precision", "said"), [("fp32", ".\n"), ("bf16", "; it learned in bfloat16, in which it may ")]
+)
 def test_a_page_says_that_a_network_learned_in_another_precision_than_it_plays_in(
     command: Command, tiny: Compose, tmp_path: Path, precision: str, said: str
 ) -> None:
