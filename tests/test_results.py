@@ -285,6 +285,17 @@ def test_the_three_networks_in_bfloat16_are_set_side_by_side_as_their_runs_are()
     assert f"a sample takes {flops / config.training.batch_size / 1e9:.2f} GFLOP of an update" in results
 
 
+def test_what_the_exported_resnet_has_in_either_precision_is_said_as_its_games_say_it() -> None:
+    card, _ = read_card(REPOSITORY / "pretrained" / "resnet")
+    exact, rounded = np.mean(card.scores), EpisodeTable.read(DOCS / "data" / "resnet_in_bfloat16.csv").scores.mean()
+    results = " ".join(RESULTS.read_text().split())
+    assert f"as exported weights are, they have {exact:,.0f} points" in results
+    assert f"the run's own network has {rounded:,.0f} with the same random streams" in results
+    assert f"{exact:,.0f} points in float32. In bfloat16, in which it learned, it has {rounded:,.0f}:" in " ".join(
+        (REPOSITORY / "CHANGELOG.md").read_text().split()
+    )
+
+
 def test_what_top_half_scores_is_said_as_its_games_say_it() -> None:
     uniform, top_half = (
         {seed: interquartile_mean(evaluated(run).scores) for seed, run in of_the_verdict(sampler).items()}
