@@ -10,6 +10,7 @@ import json
 import os
 import re
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache, partial
@@ -186,7 +187,8 @@ class Journal:
     tags, images and models are checked against MLflow's alphabet, so that publishing cannot stumble over them later.
 
     Raises:
-        JournalError: on a folder whose `commit.json` is damaged.
+        JournalError: on a folder whose `commit.json` is damaged; from `state_dict` where the journal was cut or
+            replaced since; from `load_state_dict` also where a line of it is no record.
         ValueError: on a name that MLflow would refuse, or a path that leads out of `artifacts/`.
         OSError: from `state_dict` when the disk refuses; what was durable stays so, and a later call writes the rest.
     """
@@ -271,6 +273,8 @@ class Journal:
             self._mark(replace(self._commit, offset=self._offset))  # readers first: the bytes change under them next
         content = b"".join(self._lines)
         with open(self._folder / "journal.jsonl", "ab", opener=no_link) as file:
+            if os.fstat(file.fileno()).st_size < self._offset:  # truncating would fill the gap with zeros
+                raise JournalError(f"{file.name} is shorter than its writer left it: it was cut or replaced since")
             file.truncate(self._offset)
             file.write(content)
             file.flush()
@@ -286,6 +290,12 @@ class Journal:
                 f"{path} is shorter than the checkpoint says: it was cut or replaced since; "
                 "restore it, or begin anew with resume=never, which keeps what is there"
             )
+        try:
+            deque(read(self._folder, end=state["offset"]), maxlen=0)
+        except ValueError as error:
+            raise JournalError(
+                f"{error}; restore the journal, or begin anew with resume=never, which keeps what is there"
+            ) from None
         self._offset, self._time = state["offset"], state["time"]
         self._lines.clear()
 

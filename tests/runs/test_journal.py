@@ -272,6 +272,26 @@ def test_a_journal_cut_below_its_commit_is_refused(tmp_path: Path) -> None:
         Journal(tmp_path).load_state_dict(state)
 
 
+def test_a_journal_cut_under_its_writer_is_refused_and_not_filled_with_zeros(tmp_path: Path) -> None:
+    """As where somebody removes the folder of a run that goes on, which makes it anew."""
+    journal = Journal(tmp_path)
+    journal.metrics({"score": 1}, 1)
+    journal.state_dict()
+    (tmp_path / "journal.jsonl").unlink()
+    journal.metrics({"score": 2}, 2)
+    with pytest.raises(ValueError, match="is shorter than its writer left it"):
+        journal.state_dict()
+    assert b"\0" not in (tmp_path / "journal.jsonl").read_bytes()
+
+
+def test_a_journal_with_a_damaged_line_is_refused_before_anything_is_trained_on_it(tmp_path: Path) -> None:
+    state = journaled(tmp_path, 1, 2)
+    path = tmp_path / "journal.jsonl"
+    path.write_bytes(bytes(20) + path.read_bytes()[20:])
+    with pytest.raises(ValueError, match=r"byte 0: no record of a journal.*resume=never"):
+        Journal(tmp_path).load_state_dict(state)
+
+
 def test_reading_starts_and_ends_where_it_is_told(tmp_path: Path) -> None:
     journaled(tmp_path, *range(5))
     ends = [end for end, _ in read(tmp_path)]
