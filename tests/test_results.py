@@ -45,6 +45,11 @@ def of_the_verdict(sampler: str, model: str = "cnn", precision: str = "fp32") ->
     return {config.seed: run for run, config in configs if config.training.precision == precision}
 
 
+def mean_and_iqm(games: EpisodeTable) -> str:
+    """The scores as the tables show them."""
+    return f"{games.scores.mean():,.0f} ({interquartile_mean(games.scores):,.0f})"
+
+
 def listed(words: Sequence[str]) -> str:
     """Words as a sentence lists them."""
     return f"{', '.join(words[:-1])} and {words[-1]}"
@@ -96,7 +101,7 @@ def test_survival_and_rate_of_the_longer_trainings_are_said_as_their_games_say_t
     assert longer
     for games in (*longer, *games_of_the_fields_game()):
         rate, capped = games.scores.sum() / games.frames.sum(), int(games.truncated.sum())
-        mean = f"{games.scores.mean():,.0f} ({interquartile_mean(games.scores):,.0f})"
+        mean = mean_and_iqm(games)
         cells = f"| {capped} of {len(games.scores)} | {rate:.2f} | {games.scores.min():,.0f} | {mean} |"
         assert cells in RESULTS.read_text()
 
@@ -237,10 +242,10 @@ def test_the_three_networks_in_bfloat16_are_set_side_by_side_as_their_runs_are()
             (flops,) = (float(values["flops_per_update"]) for values in tags if "flops_per_update" in values)
             counts, config, games = run.result.counts, run.trained_config, evaluated(run)
             teraflops[network] = flops * counts["updates"] / 1e12
-            rate, hits, side, *_, mean = pace_of(games)
+            rate, hits, side, *_ = pace_of(games)
             assert (
                 f"| {seed} | {network} | {config.threads} | {counts['hours']:.2f} | {teraflops[network]:,.0f} | "
-                f"{rate:.2f} | {games.steps.mean():,.0f} | {mean:,.0f} ({interquartile_mean(games.scores):,.0f}) |"
+                f"{rate:.2f} | {games.steps.mean():,.0f} | {mean_and_iqm(games)} |"
             ) in results
             chosen = games.counts[..., 0].sum(axis=0)
             wait = 100 * chosen[games.actions.index("NOOP")] / chosen.sum()
@@ -319,10 +324,7 @@ def test_what_resnet_fast_scores_with_either_sampler_is_said_as_its_games_say_it
         rows = [row for row in csv.DictReader(file) if row["kind"] == "evaluation" and row["step"] == "1000000"]
     on_gpu = {int(row["seed"]): f"{int(row['mean']):,} ({int(row['interquartile_mean']):,})" for row in rows}
     uniform, top_half = (
-        {
-            seed: f"{evaluated(run).scores.mean():,.0f} ({interquartile_mean(evaluated(run).scores):,.0f})"
-            for seed, run in of_the_verdict(sampler, "resnet_fast").items()
-        }
+        {seed: mean_and_iqm(evaluated(run)) for seed, run in of_the_verdict(sampler, "resnet_fast").items()}
         for sampler in ("uniform", "top_half")
     )
     assert on_gpu

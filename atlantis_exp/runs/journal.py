@@ -272,30 +272,20 @@ class Journal:
         if self._offset < self._commit.offset:
             self._mark(replace(self._commit, offset=self._offset))  # readers first: the bytes change under them next
         content = b"".join(self._lines)
-        with open(self._folder / "journal.jsonl", "ab", opener=no_link) as file:
-            if os.fstat(file.fileno()).st_size < self._offset:  # truncating would fill the gap with zeros
-                raise JournalError(f"{file.name} is shorter than its writer left it: it was cut or replaced since")
-            file.truncate(self._offset)
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
+        _write_from(self._folder, self._offset, [content])
         self._offset += len(content)
         self._lines.clear()
         return {"offset": self._offset, "time": self._time}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         path = self._folder / "journal.jsonl"
-        if path.stat().st_size < state["offset"]:
-            raise JournalError(
-                f"{path} is shorter than the checkpoint says: it was cut or replaced since; "
-                "restore it, or begin anew with resume=never, which keeps what is there"
-            )
         try:
+            if path.stat().st_size < state["offset"]:
+                raise ValueError(f"{path} is shorter than the checkpoint says: it was cut or replaced since")
             deque(read(self._folder, end=state["offset"]), maxlen=0)
         except ValueError as error:
-            raise JournalError(
-                f"{error}; restore the journal, or begin anew with resume=never, which keeps what is there"
-            ) from None
+            advice = "restore it, or begin anew with resume=never, which keeps what is there"
+            raise JournalError(f"{error}; {advice}") from None
         self._offset, self._time = state["offset"], state["time"]
         self._lines.clear()
 
@@ -380,9 +370,19 @@ def restore(folder: Path, start: int, pieces: Iterable[bytes]) -> None:
     """Continues a run folder's journal from an offset with bytes of another copy of it; `commit.json` makes them count.
 
     The caller holds the folder, and what is committed in it ends at `start` or before.
+
+    Raises:
+        JournalError: on a journal that ends before `start`.
     """
     make_folder(folder)
+    _write_from(folder, start, pieces)
+
+
+def _write_from(folder: Path, start: int, pieces: Iterable[bytes]) -> None:
+    """Puts bytes, durably, in the place of all that a journal holds behind an offset. Raises: JournalError, OSError."""
     with open(folder / "journal.jsonl", "ab", opener=no_link) as file:
+        if os.fstat(file.fileno()).st_size < start:  # truncating would fill the gap with zeros
+            raise JournalError(f"{file.name} is shorter than its writer left it: it was cut or replaced since")
         file.truncate(start)
         file.writelines(pieces)
         file.flush()
