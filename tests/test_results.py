@@ -301,14 +301,14 @@ def test_what_the_exported_resnet_has_in_either_precision_is_said_as_its_games_s
     )
 
 
-def test_what_top_half_scores_is_said_as_its_games_say_it() -> None:
+@pytest.mark.parametrize("model", ["cnn", "resnet_fast"])
+def test_what_top_half_scores_is_said_as_its_games_say_it(model: str) -> None:
     uniform, top_half = (
-        {seed: interquartile_mean(evaluated(run).scores) for seed, run in of_the_verdict(sampler).items()}
+        {seed: interquartile_mean(evaluated(run).scores) for seed, run in of_the_verdict(sampler, model).items()}
         for sampler in ("uniform", "top_half")
     )
     top, same, ten = [*top_half.values()], [uniform[seed] for seed in top_half], [*uniform.values()]
-    assert top
-    assert len(ten) == 10
+    assert (len(top), len(ten)) == (5, 10)
     said = (
         f"average {np.mean(top):,.0f} points, {min(top):,.0f} to {max(top):,.0f}; the same seeds of uniform sampling "
         f"average {np.mean(same):,.0f}, and all its ten {np.mean(ten):,.0f}"
@@ -417,18 +417,18 @@ def test_what_is_kept_compares_as_it_did_and_names_no_place(
 def asked_again(
     command: Callable[..., int], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> Callable[..., tuple[str, Path]]:
-    """Take the looks of a question of the page anew, over the kept runs of so many seeds each, against what is kept."""
+    """Take the looks of a section's question anew, over the kept runs of so many seeds each, against what is kept."""
 
-    def asked_again(by: str, *looks: str) -> tuple[str, Path]:
-        (question,) = re.findall(
-            rf"^    python -m atlantis_exp (compare by={by} runs=decide-.*)$", RESULTS.read_text(), re.MULTILINE
-        )
+    def asked_again(heading: str, *looks: str) -> tuple[str, Path]:
+        section = RESULTS.read_text().partition(f"# {heading}\n")[2]
+        question = re.search(r"^    python -m atlantis_exp (compare by=.* runs=decide-.*)$", section, re.MULTILINE)
+        assert question
         shutil.copytree(DOCS / "verdict" / "decisions", tmp_path / "decisions")
         for seeds in looks:  # the first before the later seeds are there
             for run in (DOCS / "verdict" / "runs").glob(f"*-s[{seeds}]-*"):
                 shutil.copytree(run, tmp_path / "runs" / run.name)
             capsys.readouterr()
-            assert command(*question.split(), "tracking=none", f"paths.outputs={tmp_path}") == 0
+            assert command(*question[1].split(), "tracking=none", f"paths.outputs={tmp_path}") == 0
         said = " ".join(capsys.readouterr().out.split())
         (made,) = tmp_path.glob("comparisons/*")
         kept = DOCS / "verdict" / "comparisons" / made.name
@@ -442,7 +442,7 @@ def asked_again(
 
 
 def test_the_verdict_is_said_as_the_kept_runs_say_it(asked_again: Callable[..., tuple[str, Path]]) -> None:
-    said, kept = asked_again("model", "01234", "56789")
+    said, kept = asked_again("The answer, so far", "01234", "56789")
 
     def only(pattern: str) -> str:
         (found,) = re.findall(pattern, said)
@@ -465,12 +465,16 @@ def test_the_verdict_is_said_as_the_kept_runs_say_it(asked_again: Callable[..., 
         assert re.search(r"{} points[^.]* {} to {}\b".format(*values), results)
 
 
+@pytest.mark.parametrize(
+    "heading", ["Uniform or top-half sampling: the first look", "Uniform or top-half sampling: ResNetFast"]
+)
 def test_the_first_look_at_top_half_sampling_is_said_as_the_kept_runs_say_it(
-    asked_again: Callable[..., tuple[str, Path]],
+    asked_again: Callable[..., tuple[str, Path]], heading: str
 ) -> None:
-    said, _ = asked_again("sampler", "0123456789")
-    found = re.search(r"Not decided: top_half against uniform \(difference (-([\d,]+)), (.*), 5 seeds each\)", said)
+    said, kept = asked_again(heading, "0123456789")
+    found = re.search(r"Not decided: top_half against uniform \(difference ((-?)([\d,]+)), (.*), 5 seeds each\)", said)
     assert found
     readme, results = (" ".join(page.read_text().split()) for page in (REPOSITORY / "README.md", RESULTS))
-    assert f"a difference of {found[1]} points ({found[3]})" in readme
-    assert f"top-half sampling has {found[2]} points less, {found[3]}." in results
+    assert f"a difference of {found[1]} points ({found[4]})" in readme
+    assert f"top-half sampling has {found[3]} points {'less' if found[2] else 'more'}, {found[4]}." in results
+    assert f"verdict/comparisons/{kept.name}/artifacts/figures/scores.png" in results
