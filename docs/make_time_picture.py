@@ -1,12 +1,13 @@
-"""Draw `docs/images/time_to_score.png` from `docs/data/time_to_score.csv`: scores of three programs by training time.
+"""Draw `docs/images/NAME.png` from `docs/data/NAME.csv`: scores of our recipe and of peers by training time.
 
-`python docs/make_time_picture.py [OUTPUT]`, from the root of the checkout. OUTPUT is a file with what
+`python docs/make_time_picture.py NAME [OUTPUTS...]`, from the root of the checkout. OUTPUTS are files with what
 `python -m benchmarks.time_to_score` printed, whose curves then take the table's place.
 """
 
 import csv
 import json
 import sys
+from collections.abc import Sequence
 from itertools import accumulate, groupby
 from pathlib import Path
 
@@ -17,7 +18,6 @@ from atlantis_exp.comparison.figures import thousands
 from atlantis_exp.media import BLUE, GREEN, GREY, VERMILLION
 from benchmarks.time_to_score import GOALS
 
-TABLE = Path("docs/data/time_to_score.csv")
 COLUMNS = ("program", "hours", "steps", "score")
 SHOWN = {
     "ours": ("experiment=fast", BLUE, "o"),
@@ -26,20 +26,25 @@ SHOWN = {
 }
 
 
-def take_over(output: Path) -> None:
+def take_over(outputs: Sequence[Path], table: Path) -> None:
     """Write the table anew from what the benchmark printed."""
-    curves = json.loads(output.read_text().splitlines()[-1])["curves"]
-    with TABLE.open("w", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(COLUMNS)
-        for program, turns in curves.items():
-            hours = accumulate(turn[0] for turn in turns)
-            table.writerows((program, f"{now:.4f}", turn[1], turn[2]) for now, turn in zip(hours, turns, strict=True))
+    with table.open("w", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(COLUMNS)
+        for output in outputs:
+            for program, turns in json.loads(output.read_text().splitlines()[-1])["curves"].items():
+                hours = accumulate(turn[0] for turn in turns)
+                rows.writerows(
+                    (program, f"{now:.4f}", turn[1], turn[2]) for now, turn in zip(hours, turns, strict=True)
+                )
 
 
-def main() -> None:
-    """Draw a line a program, and the goals."""
-    with TABLE.open(newline="") as file:
+def main(name: str, outputs: Sequence[Path]) -> None:
+    """Bring the table up to date; draw a line a program, and the goals."""
+    table = Path(f"docs/data/{name}.csv")
+    if outputs:
+        take_over(outputs, table)
+    with table.open(newline="") as file:
         rows = list(csv.DictReader(file))
     figure = Figure(figsize=(7, 4), dpi=100, layout="constrained")
     axes = figure.subplots()
@@ -55,10 +60,8 @@ def main() -> None:
     axes.set_xlim(left=0)
     thousands(axes.yaxis)
     axes.legend(frameon=False, fontsize="small")
-    figure.savefig("docs/images/time_to_score.png")
+    figure.savefig(f"docs/images/{name}.png")
 
 
 if __name__ == "__main__":
-    if arguments := sys.argv[1:]:
-        take_over(Path(arguments[0]))
-    main()
+    main(sys.argv[1], [Path(output) for output in sys.argv[2:]])

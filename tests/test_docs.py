@@ -71,12 +71,19 @@ def test_the_ladder_is_drawn_and_printed_as_the_page_has_it(
     assert [row for row in numbers if sum(shown.endswith(row) for shown in rows) != 1] == []
 
 
-def test_the_picture_of_hours_is_of_what_the_benchmark_prints(script: Callable[..., None], tmp_path: Path) -> None:
-    script("make_time_picture")
-    assert_it_is_drawn("time_to_score")
-    turns = {"ours": [[0.05, 1_000, 10.0], [0.05, 2_000, 20.0]], "sb3_qrdqn": [[0.1, 9, 0.5]]}
-    (tmp_path / "printed").write_text(f"words of progress\n{json.dumps({'curves': turns})}\n")
-    script("make_time_picture", tmp_path / "printed")
+@pytest.mark.parametrize("name", ["time_to_score", "time_to_score_longer"])
+def test_a_picture_of_hours_is_of_its_table(name: str, script: Callable[..., None]) -> None:
+    script("make_time_picture", name)
+    assert_it_is_drawn(name)
+    assert_it_is_the_table(name)
+
+
+def test_the_table_of_hours_is_what_the_benchmark_prints(script: Callable[..., None], tmp_path: Path) -> None:
+    of_ours, of_a_peer = {"ours": [[0.05, 1_000, 10.0], [0.05, 2_000, 20.0]]}, {"sb3_qrdqn": [[0.1, 9, 0.5]]}
+    outputs = [tmp_path / "ours", tmp_path / "peer"]
+    for output, turns in zip(outputs, (of_ours, of_a_peer), strict=True):
+        output.write_text(f"words of progress\n{json.dumps({'curves': turns})}\n")
+    script("make_time_picture", "time_to_score", *outputs)
     assert (tmp_path / "docs/data/time_to_score.csv").read_text().splitlines() == [
         "program,hours,steps,score",
         "ours,0.0500,1000,10.0",

@@ -224,23 +224,38 @@ def test_the_time_to_score_trains_in_turns_and_plays_after_each(capsys: pytest.C
         assert f"ours: {score:,.0f} after {steps:,} steps" in printed.err
 
 
-def test_how_much_sooner_ours_scores_is_said_as_the_kept_turns_say_it() -> None:
-    text = (DOCS / "performance.md").read_text()
-    with (DOCS / "data" / "time_to_score.csv").open() as file:
+def kept_turns(table: str) -> dict[str, list[Turn]]:
+    """The turns of each program in a table of docs/data."""
+    with (DOCS / "data" / f"{table}.csv").open() as file:
         rows = list(csv.DictReader(file))
     turns = {}
     for program, points in itertools.groupby(rows, key=lambda row: row["program"]):
         hours, steps, scores = np.array([[float(row[key]) for key in ("hours", "steps", "score")] for row in points]).T
         turns[program] = [Turn(*turn) for turn in zip(np.diff(hours, prepend=0), steps, scores, strict=True)]
+    return turns
+
+
+def as_a_row(turns: Sequence[Turn]) -> str:
+    """Steps, steps a second, last mean, highest mean before and goals, as the tables of the page have them."""
+    *earlier, last = turns
+    reached = [60 * hours_to(goal, turns) for goal in time_to_score.GOALS]
+    told = ["not reached" if math.isinf(value) else f"{value:.0f} minutes" for value in reached]
+    highest = max(turn.score for turn in earlier)
+    rate = last.steps / (3600 * hours_of(turns))
+    return f"{last.steps:,.0f} | {rate:.0f} | {last.score:,.0f} | {highest:,.0f} | {' | '.join(told)} |"
+
+
+def hours_of(turns: Sequence[Turn]) -> float:
+    """How long a program trained."""
+    return sum(turn.hours for turn in turns)
+
+
+def test_how_much_sooner_ours_scores_is_said_as_the_kept_turns_say_it() -> None:
+    text = (DOCS / "performance.md").read_text()
+    turns = kept_turns("time_to_score")
     for each in turns.values():
-        *earlier, last = each
-        minutes = sum(60 * turn.hours for turn in each)
-        assert f"after {minutes:.0f} minutes" in text
-        reached = [60 * hours_to(goal, each) for goal in time_to_score.GOALS]
-        told = ["not reached" if math.isinf(value) else f"{value:.0f} minutes" for value in reached]
-        highest = max(turn.score for turn in earlier)
-        rate = last.steps / minutes / 60
-        assert f"| {last.steps:,.0f} | {rate:.0f} | {last.score:,.0f} | {highest:,.0f} | {' | '.join(told)} |" in text
+        assert f"after {60 * hours_of(each):.0f} minutes" in text
+        assert f"| {as_a_row(each)}" in text
     sayings = ("**at least {:.1f} times sooner**", "at least {:.1f} times: the peers")
     for goal, words in zip(time_to_score.GOALS, sayings, strict=True):
         times, at_least = sooner(goal, turns) or (math.nan, False)
@@ -249,6 +264,21 @@ def test_how_much_sooner_ours_scores_is_said_as_the_kept_turns_say_it() -> None:
     first_goal = 60 * hours_to(time_to_score.GOALS[0], turns["ours"])
     assert f"25,240, after {first_goal:.0f} minutes of training;" in (DOCS.parent / "README.md").read_text()
     assert f"from {turns['ours'][0].score:,.0f} to {turns['ours'][-1].score:,.0f}" in text
+
+
+def test_how_much_sooner_it_is_than_the_better_peer_is_said_as_the_longer_turns_say_it() -> None:
+    readme, text = (" ".join(page.read_text().split()) for page in (DOCS.parent / "README.md", DOCS / "performance.md"))
+    turns = kept_turns("time_to_score_longer")
+    for each in turns.values():
+        assert f"| {60 * hours_of(each):.0f} minutes | {as_a_row(each)}" in text
+    times, at_least = sooner(time_to_score.GOALS[0], turns) or (math.nan, False)
+    assert at_least
+    assert f"**at least {times:.1f} times sooner** than sb3-contrib's QR-DQN" in text
+    first_goal = 60 * hours_to(time_to_score.GOALS[0], turns["ours"])
+    assert (
+        f"{first_goal:.0f} minutes; sb3-contrib's QR-DQN has not after {60 * hours_of(turns['sb3_qrdqn']):.0f}"
+        in readme
+    )
 
 
 def test_a_ship_is_seen_in_its_lane_and_a_shot_is_none() -> None:
