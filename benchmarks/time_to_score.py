@@ -171,6 +171,11 @@ def turn_of(name: str, contestant: Contestant[Turn], seconds: float) -> Turn:
     return turn
 
 
+def hours_of(turns: Sequence[Turn]) -> float:
+    """The training of all turns."""
+    return sum(turn.hours for turn in turns)
+
+
 def hours_to(goal: float, turns: Sequence[Turn]) -> float:
     """The training after which a score was first reached, infinite where it was not."""
     hours = itertools.accumulate(turn.hours for turn in turns)
@@ -185,7 +190,7 @@ def sooner(goal: float, turns: dict[str, list[Turn]]) -> tuple[float, bool] | No
     if math.isinf(own) or not reached:
         return None
     best = min(reached.values())
-    longest = max(sum(turn.hours for turn in turns[name]) for name in reached)
+    longest = max(hours_of(turns[name]) for name in reached)
     return min(best, longest) / own, math.isinf(best)
 
 

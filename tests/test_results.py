@@ -55,6 +55,11 @@ def listed(words: Sequence[str]) -> str:
     return f"{', '.join(words[:-1])} and {words[-1]}"
 
 
+def section_of(heading: str) -> str:
+    """What the page has under a heading, up to the next one."""
+    return RESULTS.read_text().partition(f"# {heading}\n")[2].partition("\n#")[0]
+
+
 def of_the_fields_game() -> dict[int, RunFolder]:
     """The kept trainings in the field's game, by seed."""
     return {run.trained_config.seed: run for run, folder in KEPT if folder == "standard"}
@@ -321,7 +326,8 @@ def test_what_top_half_scores_is_said_as_its_games_say_it(model: str) -> None:
 
 def test_what_resnet_fast_scores_with_either_sampler_is_said_as_its_games_say_it() -> None:
     with (DOCS / "data" / "top_half_on_a_gpu.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["kind"] == "evaluation" and row["step"] == "1000000"]
+        printed = list(csv.DictReader(file))
+    rows = [row for row in printed if row["kind"] == "evaluation" and row["step"] == "1000000"]
     on_gpu = {int(row["seed"]): f"{int(row['mean']):,} ({int(row['interquartile_mean']):,})" for row in rows}
     uniform, top_half = (
         {seed: mean_and_iqm(evaluated(run)) for seed, run in of_the_verdict(sampler, "resnet_fast").items()}
@@ -332,6 +338,12 @@ def test_what_resnet_fast_scores_with_either_sampler_is_said_as_its_games_say_it
     for seed in on_gpu.keys() | top_half.keys():
         row = f"| {seed} | {uniform[seed]} | {top_half.get(seed, '-')} | {on_gpu.get(seed, '-')} |"
         assert row in RESULTS.read_text()
+    run = of_the_verdict("top_half", "resnet_fast")[4]
+    (there,) = (float(row["mean"]) for row in rows if row["seed"] == "4")
+    assert f"yet the two differ by {evaluated(run).scores.mean() - there:,.0f} points" in RESULTS.read_text()
+    begun = [float(row["mean"]) for row in printed if row["kind"] == "training" and row["seed"] == "4"][:3]
+    records = (record.values for record in run.records() if isinstance(record, Metrics))
+    assert set(begun) <= {values["score/mean_20"] for values in records if "score/mean_20" in values}
 
 
 def test_published_curves_are_quoted_as_they_are() -> None:
@@ -420,15 +432,14 @@ def asked_again(
     """Take the looks of a section's question anew, over the kept runs of so many seeds each, against what is kept."""
 
     def asked_again(heading: str, *looks: str) -> tuple[str, Path]:
-        section = RESULTS.read_text().partition(f"# {heading}\n")[2]
-        question = re.search(r"^    python -m atlantis_exp (compare by=.* runs=decide-.*)$", section, re.MULTILINE)
-        assert question
+        section = section_of(heading)
+        (question,) = re.findall(r"^    python -m atlantis_exp (compare by=.* runs=decide-.*)$", section, re.MULTILINE)
         shutil.copytree(DOCS / "verdict" / "decisions", tmp_path / "decisions")
         for seeds in looks:  # the first before the later seeds are there
             for run in (DOCS / "verdict" / "runs").glob(f"*-s[{seeds}]-*"):
                 shutil.copytree(run, tmp_path / "runs" / run.name)
             capsys.readouterr()
-            assert command(*question[1].split(), "tracking=none", f"paths.outputs={tmp_path}") == 0
+            assert command(*question.split(), "tracking=none", f"paths.outputs={tmp_path}") == 0
         said = " ".join(capsys.readouterr().out.split())
         (made,) = tmp_path.glob("comparisons/*")
         kept = DOCS / "verdict" / "comparisons" / made.name
@@ -474,7 +485,7 @@ def test_the_first_look_at_top_half_sampling_is_said_as_the_kept_runs_say_it(
     said, kept = asked_again(heading, "0123456789")
     found = re.search(r"Not decided: top_half against uniform \(difference ((-?)([\d,]+)), (.*), 5 seeds each\)", said)
     assert found
-    readme, results = (" ".join(page.read_text().split()) for page in (REPOSITORY / "README.md", RESULTS))
+    readme, section = (" ".join(text.split()) for text in ((REPOSITORY / "README.md").read_text(), section_of(heading)))
     assert f"a difference of {found[1]} points ({found[4]})" in readme
-    assert f"top-half sampling has {found[3]} points {'less' if found[2] else 'more'}, {found[4]}." in results
-    assert f"verdict/comparisons/{kept.name}/artifacts/figures/scores.png" in results
+    assert f"top-half sampling has {found[3]} points {'less' if found[2] else 'more'}, {found[4]}." in section
+    assert f"verdict/comparisons/{kept.name}/artifacts/figures/scores.png" in section

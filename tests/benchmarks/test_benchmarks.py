@@ -28,7 +28,7 @@ from benchmarks import (
 )
 from benchmarks.composition import composed
 from benchmarks.contest import paired_ratio, ratio, take_turns
-from benchmarks.time_to_score import Turn, hours_to, sooner
+from benchmarks.time_to_score import Turn, hours_of, hours_to, sooner
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 Main = Callable[[Sequence[str]], None]
@@ -243,11 +243,6 @@ def as_a_row(turns: Sequence[Turn]) -> str:
     highest = max(turn.score for turn in earlier)
     rate = last.steps / (3600 * hours_of(turns))
     return f"{last.steps:,.0f} | {rate:.0f} | {last.score:,.0f} | {highest:,.0f} | {' | '.join(told)} |"
-
-
-def hours_of(turns: Sequence[Turn]) -> float:
-    """How long a program trained."""
-    return sum(turn.hours for turn in turns)
 
 
 def test_how_much_sooner_ours_scores_is_said_as_the_kept_turns_say_it() -> None:
