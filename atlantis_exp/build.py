@@ -114,7 +114,8 @@ def choose_precision(name: str, device: torch.device) -> str:
     if name != "auto":
         return name
     if device.type == "cuda":
-        return "bf16" if torch.cuda.is_bf16_supported() else "fp32"
+        # Before Ampere torch takes bf16, too, and computes it in float32 piece by piece.
+        return "bf16" if torch.version.hip or torch.cuda.get_device_capability(device) >= (8, 0) else "fp32"
     has = torch.cpu.get_capabilities()
     # Intel's AVX-512 multiplies bf16 half as fast as fp32 (docs/performance.md), its AMX faster.
     is_faster = has.get("amx_bf16") or (has.get("avx512_bf16") and "Intel" not in has.get("cpu_name", ""))

@@ -64,7 +64,7 @@ class EnvConfig:
     sticky: Probability
     max_frames: Annotated[int, Field(ge=1, lt=2**31)]  # frames an episode
     max_steps: Count | None  # steps an episode
-    noop_max: Annotated[int, Field(ge=0, le=30)]  # steps
+    noop_max: Annotated[int, Field(ge=0, le=30)]  # frames
     max_pool: bool
     crop: tuple[int, int, int, int]  # UP, RIGHT, DOWN, LEFT: screen[UP:DOWN, LEFT:RIGHT]
     size: Size  # pixels
@@ -459,6 +459,9 @@ class Config:
             )
         if not self.phase:
             raise ConfigError("phase: at least one phase is needed, as in conf/phase/single.yaml")
+        for key in (*(f"phase.{name}" for name in self.phase), *(f"samplers.{name}" for name in self.samplers)):
+            if not re.fullmatch(r"\w+\.[\w. -]{1,100}", key, re.ASCII):
+                raise ConfigError(f"{key!a}: a name has at most 100 characters, a to z, A to Z, 0 to 9, and '_. -'")
         for name, phase in self.phase.items():
             if (phase.episodes is None) == (phase.steps is None):
                 raise ConfigError(f"phase.{name}: set either episodes or steps, the other to null")

@@ -4,7 +4,7 @@ A comparison has a `Plan`: at which numbers of seeds it looks, and the error tha
 `decide` takes the look that is due and returns the verdicts with the record of looks, which is the input of the next
 call. Each look tests by Welch's t with the error that it may spend (Lan and DeMets 1983; quadratic in the number of
 seeds, Kim and DeMets 1987), divided among the pairs that are open (Holm 1979). Both divisions are Bonferroni's, so they
-hold for any number of looks at any time and for pairs that share a group.
+hold for any number of looks and for pairs that share a group; not where the scores themselves say when to look.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence

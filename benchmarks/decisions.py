@@ -2,7 +2,8 @@
 
 Groups of ten seeds are drawn whose true means are known, and users compare them through `atlantis_exp.decision`: one
 who trains up to the next look that is printed, one who asks after every seed, and one who asks after every seed and has
-a look taken each time. All of them continue until nothing is open. A decision is false where it says better or worse
+a look taken each time. All of them continue until nothing is open. The plan promises nothing to a fourth, who watches
+the scores and asks once they are far enough apart. A decision is false where it says better or worse
 of two groups of one mean, or equivalent of two that are delta apart. Values are in standard deviations of one group.
 """
 
@@ -68,6 +69,16 @@ def one_by_one(values: Values, plan: Plan) -> tuple[Decision, int]:
 def every_seed(values: Values, plan: Plan) -> tuple[Decision, int]:
     """Ask after every seed, and have a look taken whether it is due or not."""
     return _follow(values, plan, lambda trained, _: trained + 1, now=True)
+
+
+def watching(values: Values, plan: Plan) -> tuple[Decision, int]:
+    """Look at the scores after every seed, and ask for the first time once they are far enough apart to be decided."""
+    for trained in range(plan.looks[0], plan.looks[-1] + 1):
+        seeds = {f"group {index}": dict(enumerate(row[:trained])) for index, row in enumerate(values.tolist())}
+        decision = decide(seeds, plan, now=True)
+        if any(verdict.said != "not decided" for verdict in decision.verdicts):
+            break
+    return decision, trained
 
 
 def _follow(values: Values, plan: Plan, train: Callable[[int, int], int], now: bool) -> tuple[Decision, int]:
@@ -222,6 +233,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         [(cell, *map(percent, users.values())) for cell, users in wrong.items()],
     )
 
+    watched = {
+        shape: float(np.mean([false_decision(values, plan, watching) for values in drawn]))
+        for shape, draw in SHAPES.items()
+        for drawn in [draw(np.random.default_rng(2), (count, 2, SEEDS))]
+    }
+    print_table(
+        "two equal groups of which something is decided, where the scores say when to ask, in %",
+        ("", "watching"),
+        [(shape, percent(share)) for shape, share in watched.items()],
+    )
+
     single = Plan(looks=(SEEDS,))
     power = {}
     for (shape, draw), groups, difference in product(SHAPES.items(), GROUPS, (1, 2)):
@@ -330,6 +352,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "simulations": count,
             "worst_false_decision": max(share for users in wrong.values() for share in users.values()),
             "false_decisions": wrong,
+            "watching": watched,
             "power": {cell: [row["power"], row["power_at_ten"]] for cell, row in power.items()},
             "seeds": {cell: row["seeds"] for cell, row in power.items()},
             "before_and_after": after,

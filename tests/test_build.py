@@ -55,6 +55,15 @@ def test_the_automatic_precision_is_the_faster_one(
     assert build.choose_precision("bf16", torch.device("cpu")) == "bf16"
 
 
+@pytest.mark.parametrize(("capability", "precision"), [((7, 5), "fp32"), ((8, 0), "bf16"), ((9, 0), "bf16")])
+def test_a_gpu_without_bf16_of_its_own_is_given_fp32(
+    capability: tuple[int, int], precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capabilities = {torch.device("cuda:1"): capability}
+    monkeypatch.setattr(torch.cuda, "get_device_capability", capabilities.__getitem__)
+    assert build.choose_precision("auto", torch.device("cuda:1")) == precision
+
+
 def test_a_gpu_is_asked_for_bits_that_repeat_and_for_all_of_float32(
     tiny: Callable[..., Config], monkeypatch: pytest.MonkeyPatch
 ) -> None:

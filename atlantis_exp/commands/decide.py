@@ -1,7 +1,6 @@
 """`python -m atlantis_exp decide model=cnn,resnet_fast`: trains the seeds that the question needs, and answers it."""
 
 import dataclasses
-import itertools
 from collections.abc import Callable, Iterable
 from functools import cache, partial
 from typing import TYPE_CHECKING, Annotated
@@ -13,7 +12,16 @@ from pydantic.dataclasses import dataclass
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.compare import as_texts, margin
 from atlantis_exp.commands.jobs import training_of
-from atlantis_exp.commands.overrides import check, key_of, read_flags, read_override, refuse_twice, swept, values_of
+from atlantis_exp.commands.overrides import (
+    check,
+    combined,
+    key_of,
+    read_flags,
+    read_override,
+    refuse_twice,
+    swept,
+    values_of,
+)
 from atlantis_exp.config import FREE, STRICT, Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import command_line
@@ -89,7 +97,7 @@ def request_of(asked: Asked[DecideConfig]) -> "Request":
         if not override.is_discrete_sweep() or isinstance(override.value(), Glob):
             raise ConfigError(f"{text}: no list of values; write them out, as in model=cnn,resnet_fast")
         choices.append([f"{text.split('=', 1)[0]}={value}" for value in values_of(override)])
-    contenders = list(itertools.product(*choices))
+    contenders = list(combined(choices))
     if len(contenders) < 2:
         raise ConfigError("nothing to decide between: give a key several values, as in model=cnn,resnet_fast")
     texts = read_flags(typed)[0]  # as typed: Hydra has put values in the place of ${...}

@@ -2,6 +2,7 @@
 
 import argparse
 import itertools
+import math
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,7 +15,7 @@ from hydra import compose
 from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Override, RangeSweep
 from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -30,6 +31,8 @@ from atlantis_exp.sessions.job import quoted
 from atlantis_exp.sessions.launchers import BASIC, Launcher
 
 T = TypeVar("T")
+
+_MOST_JOBS = 10_000  # of a sweep, and values of a key
 
 
 def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[tuple[str, ...], T]:
@@ -187,6 +190,8 @@ def read_override(text: str) -> Override:
         return OverridesParser.create().parse_override(text)
     except ValueError:  # Python's own
         raise ConfigError(f"{text[:60]}...: a number of more than 4,300 digits") from None
+    except RecursionError:
+        raise ConfigError(f"{text[:60]}...: lists within lists, too deep to be read") from None
     except HydraException:
         raise ConfigError(
             f"{text}: not readable; write KEY=VALUE, a list as KEY=[1,2], other characters in quotes as KEY='\"a ü\"'"
@@ -212,12 +217,20 @@ def _jobs(overrides: list[Override]) -> Iterator[list[str]]:
             choices.append([f"{key}={value}" for value in values_of(override)])
         else:
             choices.append([str(override.input_line)])
-    for combination in itertools.product(*choices):
-        yield list(combination)
+    yield from map(list, combined(choices))
+
+
+def combined(choices: Sequence[Sequence[str]]) -> Iterator[tuple[str, ...]]:
+    """One of each with each of the others, the last one first to change. Raises: ConfigError for too many."""
+    if (count := math.prod(map(len, choices))) > _MOST_JOBS:
+        raise ConfigError(f"these values make {count:,} jobs, more than {_MOST_JOBS:,}: name fewer")
+    return itertools.product(*choices)
 
 
 def values_of(override: Override) -> list[str]:
-    """The values that an override lists. Raises: ConfigError where there are none."""
+    """The values that an override lists. Raises: ConfigError where there are none, or more than a sweep has jobs."""
+    if isinstance(listed := override.value(), RangeSweep) and is_longer(listed, _MOST_JOBS):
+        raise ConfigError(f"{override.input_line}: more than {_MOST_JOBS:,} values")
     try:
         values = [*override.sweep_string_iterator()]
     except ValueError as error:  # a range in steps of 0
@@ -229,6 +242,13 @@ def values_of(override: Override) -> list[str]:
     if not values:
         raise ConfigError(f"{override.input_line}: there is no value in it")
     return values
+
+
+def is_longer(values: RangeSweep, most: int) -> bool:
+    """Whether a range has more numbers; not where its step is 0, of which Python has a word to say."""
+    assert values.start is not None
+    assert values.stop is not None
+    return values.step != 0 and abs(values.stop - values.start) > most * abs(values.step)
 
 
 def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | None) -> T:

@@ -8,13 +8,14 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 
 from atlantis_exp.commands.app import Asked
 from atlantis_exp.commands.jobs import job_of
-from atlantis_exp.commands.overrides import check, key_of, read_flags, read_override
+from atlantis_exp.commands.overrides import check, is_longer, key_of, read_flags, read_override
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.space import Space
 
 _CORNERS = 32  # configs that are composed before a search starts, at 0.1 s each; a larger space is checked by its edges
+_MOST_NUMBERS = 100_000  # of a range with fractions
 
 
 def read_space(texts: Mapping[str, str], closed: set[str]) -> Space:
@@ -45,9 +46,13 @@ def _read(key: str, text: str, closed: set[str]) -> CategoricalDistribution | Fl
         if isinstance(values, IntervalSweep):
             low, high, step = values.start, values.end, None
         elif isinstance(values, RangeSweep):
-            if not (numbers := sorted(values.range())):
+            drawn = values.range()
+            if not isinstance(drawn, range) and is_longer(values, _MOST_NUMBERS):
+                raise ValueError(f"more than {_MOST_NUMBERS:,} numbers; write interval(a, b)")
+            numbers = drawn if isinstance(drawn, range) else [*drawn]
+            if not numbers:
                 raise ValueError("there is no number in it")
-            low, high, step = numbers[0], numbers[-1], abs(values.step)
+            low, high, step = min(numbers[0], numbers[-1]), max(numbers[0], numbers[-1]), abs(values.step)
         else:
             return CategoricalDistribution(list(dict.fromkeys(override.sweep_string_iterator())))
         is_log = "log" in values.tags

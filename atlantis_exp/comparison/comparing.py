@@ -88,7 +88,7 @@ def compare(
         none = f": none of {len(gathered.trainings)} has where={','.join(where)}" if gathered.trainings else ""
         raise ConfigError(f"there is no finished training under {outputs / 'runs'} that compare was asked for{none}")
     refuse_mixed_protocols(trainings, question.by)
-    question = replace(question, by=shortened(question.by, trainings))
+    question = replace(question, by=shortened(question.by, trainings[0].facts))
     groups = group(trainings, question.by)
     asked = families([group_of(members, question.by) for members in groups.values()], question)
 
@@ -241,4 +241,4 @@ def _print_film(played: Sequence[Training | Player]) -> None:
 
 def slug(groups: Sequence[str]) -> str:
     """What a folder or a file is called after the groups' labels."""
-    return re.sub(r"[^A-Za-z0-9.]+", "-", "-vs-".join(groups))[:80].strip("-")
+    return re.sub(r"[^A-Za-z0-9.]+", "-", "-vs-".join(groups))[:80].strip("-.") or "group"

@@ -233,10 +233,10 @@ def resolve(key: str, config: Mapping[str, Any]) -> str:
     return next((name for name in (key, f"{key}.name", f"{key}.id") if name in config), "")
 
 
-def shortened(keys: Iterable[str], trainings: Sequence[Training]) -> tuple[str, ...]:
-    """Keys as people call them, each once: `model` for `model.name`."""
-    facts, short = trainings[0].facts, []
-    for key in keys:
+def shortened(keys: Iterable[str], facts: Mapping[str, Any]) -> tuple[str, ...]:
+    """Keys as people call them, each once: `model` for `model.name`; in alphabetical order of the whole ones."""
+    short = []
+    for key in sorted(keys, key=lambda key: resolve(key, facts)):
         stem = key.removesuffix(".name").removesuffix(".id")
         short.append(stem if resolve(stem, facts) == key else key)
     return tuple(dict.fromkeys(short))

@@ -12,9 +12,7 @@ from atlantis_exp.comparison.verdict import Answer, Family
 from atlantis_exp.decision import FEWEST_SEEDS, Look
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import SMALL, read_file, write_file
-
-LOOKS = "looks.json"
-
+from atlantis_exp.runs.folder import CONFIG, LOOKS
 
 _RECORD = TypeAdapter(dict[str, list[Look]])
 
@@ -26,10 +24,12 @@ def read_looks(folder: Path, families: Sequence[Family]) -> Record:
     """The looks taken at some families; empty before the first.
 
     Raises:
-        Fault: on a file that no comparison of these families left so.
+        Fault: on a file that no comparison of these families left so, or where a comparison that was made lacks it.
     """
     path = folder / LOOKS
     if not path.exists():
+        if (folder / CONFIG).exists():  # which is written after the looks
+            raise Fault(f"{path} is gone: restore it, for without it the error of the looks in it would be spent again")
         return {}
     try:
         record = _RECORD.validate_json(read_file(path, SMALL), strict=True)

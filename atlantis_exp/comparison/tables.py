@@ -35,7 +35,7 @@ class Comparison:
     groups: list[str]
     by: list[str]
     answers: list[Answer]
-    verdict: str  # the answer to what is asked first
+    verdict: str  # the answer by the first key
     others: list[str]  # the answers to the rest of the question
     caveats: list[str]  # what can make a verdict mean something else
     notes: list[str]

@@ -25,7 +25,7 @@ _SHORTEST_COMMIT = 4  # digits of a commit's name, as git itself wants them
 class Question:
     """What is asked of groups, and the error that the whole answer may have."""
 
-    by: Sequence[str]  # keys, the first of which is what is asked first
+    by: Sequence[str]  # keys
     seeds: int = 10  # a group, at the plan's last look
     error: float = 0.05  # probability of any false verdict, over all families, pairs and looks
     delta: float | None = None  # a difference that does not matter
@@ -84,7 +84,7 @@ def group_of(runs: Sequence[Training], by: Sequence[str]) -> Group:
 
 
 def families(groups: Sequence[Group], question: Question) -> list[Family]:
-    """What a question compares, the first key's values first; none where there is one group only.
+    """What a question compares, key by key; none where there is one group only.
 
     Each key with several values is a family, whose values are averaged over the groups of the other keys at the same
     seed: over those groups that all values have the like of, and the seeds that all of these have. Where several keys
@@ -131,16 +131,16 @@ def _baseline(
         choices = [(name, value, label) for value, label in named.items()]
     else:
         choices = [(name, value, value) for name, values in members for value in values]
-    exact = [(name, label) for name, value, label in choices if asked in (value, value.partition("=")[2])]
+    exact = {(name, label): value for name, value, label in choices if asked in (value, *value.split("=", 1)[1:])}
     started = {
         (name, label): value
         for name, value, label in choices
         if name == COMMIT and len(asked) >= _SHORTEST_COMMIT and (value.startswith(asked) or asked.startswith(value))
     }
-    if exact or len(started) == 1:
-        return dict((exact or list(started))[:1])
-    if started:
-        raise ConfigError(f"baseline={asked}: could be any of {', '.join(started.values())}")
+    if len(found := exact or started) == 1:
+        return dict([*found])
+    if found:
+        raise ConfigError(f"baseline={asked}: could be any of {', '.join(found.values())}")
     raise ConfigError(f"baseline={asked}: no such group; {nearest(asked, {value for _, value, _ in choices})}")
 
 

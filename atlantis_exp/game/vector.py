@@ -6,9 +6,10 @@ import os
 import signal
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Container, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from ctypes import Array, c_ubyte
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any, NamedTuple, Self, final
@@ -166,14 +167,15 @@ class ProcessEmulators(Emulators):
         self._processes: list[multiprocessing.context.SpawnProcess] = []
         cores = _cores_for(workers)
         atexit.register(self.close)  # multiprocessing's own exit waits for workers that are deaf to its SIGTERM
-        for worker, envs in enumerate(self._envs):
-            connection, theirs = context.Pipe()
-            core = cores[worker % len(cores)] if cores else None
-            process = context.Process(target=_work, args=(core, theirs, make, envs, memory, row), daemon=True)
-            process.start()
-            theirs.close()  # the worker now holds the only other end, so its death ends the pipe
-            self._connections.append(connection)
-            self._processes.append(process)
+        with _signals_held():
+            for worker, envs in enumerate(self._envs):
+                connection, theirs = context.Pipe()
+                core = cores[worker % len(cores)] if cores else None
+                process = context.Process(target=_work, args=(core, theirs, make, envs, memory, row), daemon=True)
+                process.start()
+                theirs.close()  # the worker now holds the only other end, so its death ends the pipe
+                self._connections.append(connection)
+                self._processes.append(process)
 
     def close(self) -> None:
         atexit.unregister(self.close)
@@ -209,6 +211,18 @@ def make_emulators(make: Callable[[], Emulator], num_envs: int, workers: int) ->
     if num_envs == 1 or workers == 0:
         return SerialEmulators(make, num_envs)
     return ProcessEmulators(make, num_envs, min(workers, num_envs))
+
+
+@contextmanager
+def _signals_held() -> Iterator[None]:
+    """Has the signals that are the parent's wait for the block's end, and for processes begun in it to ignore them."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _FOR_THE_PARENT)
+    try:
+        resource_tracker.ensure_running()  # which every first process would start, and which lets some of them through
+        signal.pthread_sigmask(signal.SIG_BLOCK, _FOR_THE_PARENT)
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _row(emulator: Emulator) -> np.dtype[np.void]:

@@ -15,7 +15,7 @@ Count = Annotated[int, Interval(ge=1, le=1_000_000_000_000)]
 
 
 class Schedule(Protocol):
-    """A value at every progress >= 0, after so many steps; progress exceeds 1 when a training is prolonged."""
+    """A value at every progress >= 0, after so many steps; progress exceeds 1 past the last planned episode."""
 
     def __call__(self, progress: float, steps: int) -> float: ...
 

@@ -17,6 +17,7 @@ from atlantis_exp.runs.journal import Commit, Record, Status, has_lost_commit, r
 
 CONFIG, RESULT, COMMIT = "config.json", "result.json", "commit.json"
 TRACEBACK = "traceback.txt"
+LOOKS = "looks.json"  # of a comparison
 """Why a run failed last, at length."""
 CHECKPOINTS = "checkpoints"
 """The folder of a training's checkpoints."""
@@ -122,6 +123,12 @@ class RunFolder:
         if not self.has_started or (result := self.result) is None:
             return None
         return None if result.outcome == "budget" and (budget is None or budget > result.steps) else result
+
+    def put_aside(self) -> Path:
+        """Renames the folder, for a new run to have its place; returns where it is now. Raises: Fault while held."""
+        kept = next(path for n in range(1, 10_000) if not (path := self.path.with_name(f"{self.name}~{n}")).exists())
+        with self.held():
+            return self.path.rename(kept)
 
     @property
     def has_lost_checkpoints(self) -> bool:

@@ -105,7 +105,7 @@ def portable(config: Config) -> Config:
         threads=None,
         compile=False,
         env=replace(config.env, workers=None),
-        training=replace(config.training, weights=begun and f"{Path(begun[0]).name}@{begun[1]}"),
+        training=replace(config.training, weights=begun and f"{Path(begun[0]).name or 'weights'}@{begun[1]}"),
         tracking=replace(config.tracking, uri=None),
         paths=PathsConfig(outputs="outputs"),
     )

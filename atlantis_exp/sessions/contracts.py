@@ -31,6 +31,7 @@ from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.training import expected
 from atlantis_exp.sessions.verifying import fingerprints, train_and_kill
 from atlantis_exp.training.checkpoint import to_safetensors
+from atlantis_exp.training.plan import Counters
 from atlantis_exp.training.progress import Progress
 
 _SIDES = (84, 159)  # pixels
@@ -302,7 +303,7 @@ def _costs(jobs: Sequence[Job]) -> Table:
             path = Path(folder)
             trainer = build_trainer(config, path, Journal(path), Progress(terminal.console()))
             with trainer.emulators:
-                steps = expected(trainer, config, 0).steps_per_second
+                steps = expected(trainer, config, Counters()).steps_per_second
         counts = f"{count_parameters(learner.network):,}", f"{flops / 1e6:,.0f} M"
         table.add_row(config.model.name, str(size), *counts, f"{updates / passed:,.1f}", f"{steps:,.0f}")
     return table

@@ -21,7 +21,7 @@ from atlantis_exp import terminal
 from atlantis_exp.build import build_trainer
 from atlantis_exp.checking import digest, flatten, to_dict
 from atlantis_exp.comparison.comparing import compare
-from atlantis_exp.comparison.gather import mixed_protocol, resolve, values_in
+from atlantis_exp.comparison.gather import mixed_protocol, resolve, shortened, values_in
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.comparison.tables import Comparison
 from atlantis_exp.comparison.verdict import Family, Group, Question, families, wanted
@@ -37,6 +37,7 @@ from atlantis_exp.sessions.sweep import ledger, terminable
 from atlantis_exp.sessions.training import expected, train
 from atlantis_exp.tracking.publishing import catch_up, publishing
 from atlantis_exp.training.forecast import duration
+from atlantis_exp.training.plan import Counters
 from atlantis_exp.training.progress import Progress
 
 
@@ -103,30 +104,29 @@ class _Session:
 
     @classmethod
     def of(cls, request: Request) -> "_Session":
-        question = request.question
+        jobs = {chosen: request.job_of((*request.fixed, *chosen)) for chosen in request.contenders}
+        facts_of = {chosen: flatten(to_dict(job.config)) for chosen, job in jobs.items()}
+        keys = request.question.by
+        if unknown := [key for key in keys for facts in facts_of.values() if not resolve(key, facts)]:
+            raise ConfigError(f"{unknown[0]}: is no single key; name those that differ, as in objective=dqn,quantile")
+        question = replace(request.question, by=shortened(keys, facts_of[request.contenders[0]]))
         contenders: dict[str, tuple[tuple[str, ...], Job]] = {}
         configs: dict[str, dict[str, Any]] = {}
         trained: dict[str, tuple[str, ...]] = {}  # by the name of the run
         groups = []
-        for chosen in request.contenders:
-            job = request.job_of((*request.fixed, *chosen))
-            facts = flatten(to_dict(job.config))
-            if unknown := [key for key in question.by if not resolve(key, facts)]:
-                raise ConfigError(
-                    f"{unknown[0]}: is no single key; name those that differ, as in objective=dqn,quantile"
-                )
-            group = Group(values_in(facts, question.by), {})
+        for chosen, job in jobs.items():
+            group = Group(values_in(facts_of[chosen], question.by), {})
             if group.label in contenders:
                 raise ConfigError(f"{' '.join(chosen)}: the same contender as {' '.join(contenders[group.label][0])}")
             if (twin := trained.setdefault(job.config.run_name(), chosen)) is not chosen:
                 raise ConfigError(f"{' '.join(chosen)}: trains what {' '.join(twin)} trains, under the same name")
-            contenders[group.label], configs[group.label] = (chosen, job), facts
+            contenders[group.label], configs[group.label] = (chosen, job), facts_of[chosen]
             groups.append(group)
         if mixed := mixed_protocol(configs, question.by):
             raise ConfigError(f"{mixed[1]}; give that key itself several values, or train them under one protocol")
         asked = families(groups, question)
         config = next(iter(contenders.values()))[1].config
-        session = cls(request, contenders, asked, RunFolder(Path(config.paths.outputs)))
+        session = cls(replace(request, question=question), contenders, asked, RunFolder(Path(config.paths.outputs)))
         session.refuse_longer_runs()
         identity = {
             **vars(question),
@@ -323,7 +323,7 @@ class _Session:
         with tempfile.TemporaryDirectory() as aside:
             trainer = build_trainer(config, Path(aside), NullJournal(), Progress(Console(quiet=True)))
             with trainer.emulators:
-                return expected(trainer, config, 0).hours
+                return expected(trainer, config, Counters()).hours
 
     def _spread(self) -> tuple[float, str] | None:
         """The standard deviation over seeds as a share of the score, and where that is known from; None if nowhere."""

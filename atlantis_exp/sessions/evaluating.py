@@ -1,5 +1,6 @@
 """Any player played, its report printed, and the evaluation kept as a run of its own."""
 
+import re
 import shutil
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -77,7 +78,7 @@ def evaluate(
         actor = build_exported_actor(trained, stored, device)
     evaluation = replace(evaluation, num_envs=evaluation.at_once)
     facts = {**source, "step": step, "evaluation": to_dict(evaluation), "env": to_dict(trained.env)}
-    recorded = RunFolder(outputs / "evaluations" / f"{name}-at-{step}-{digest(facts)[:6]}")
+    recorded = RunFolder(outputs / "evaluations" / f"{_placeable(name)}-at-{step}-{digest(facts)[:6]}")
     shown = labels(f"evaluation of {title} at {step} {digest(facts)[:6]}", config_colour(trained), "evaluation")
     with _held(recorded):
         played = _play(f"{name} at step {step:,}", actor, trained.env, evaluation)
@@ -85,6 +86,11 @@ def evaluate(
     if card:
         table = side_by_side(card, evaluation, [episode.score for episode in played[0].episodes])
         terminal.console(least=130).print(table)
+
+
+def _placeable(name: str) -> str:
+    """A name as a folder has it that can come back from a server (`store.PLACE`)."""
+    return re.sub(r"[^A-Za-z0-9_.,~+=@-]+", "-", name).lstrip("_.,~+=@-")[:150] or "weights"
 
 
 def play_baseline(

@@ -8,7 +8,7 @@ from pathlib import Path
 from atlantis_exp import terminal
 from atlantis_exp.config import PathsConfig
 from atlantis_exp.faults import Fault
-from atlantis_exp.tracking.store import Store
+from atlantis_exp.tracking.store import Store, first_line
 from atlantis_exp.tracking.views import COMPARISONS, START, address
 
 
@@ -21,8 +21,14 @@ def serve(*, port: int, paths: PathsConfig) -> None:
         except OSError as error:
             raise Fault(f"port={port}: {error.strerror}; choose another, as in port=5001") from None
     store = Store(Path(paths.outputs))
-    with terminal.working("preparing MLflow's store"):
-        store.prepare()
+    try:
+        with terminal.working("preparing MLflow's store"):
+            store.prepare()
+    except (Fault, OSError):
+        raise
+    except Exception as error:  # MLflow's and the database's own
+        reason = first_line(error)
+        raise Fault(f"{store.uri} cannot be opened: {reason}; without that file sync makes it again") from None
     for what, view in (("comparisons", COMPARISONS), ("MLflow UI", START)):
         print(f"{what}: {address(f'http://127.0.0.1:{port}', store.experiment_id, view)}", flush=True)
     os.environ["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] = "false"  # ten processes otherwise

@@ -88,9 +88,12 @@ def _page(
         catch_up(outputs, jobs[0].config.tracking.uri)  # the jobs do not
     others = () if launcher.is_basic else folders
     with sweep.held(), terminable():
-        for folder in folders:
-            with suppress(Fault), folder.held():  # what runs elsewhere stays where it is
-                adopt(folder.path, sweep.path)
+        for job, folder in zip(jobs, folders, strict=True):
+            with suppress(Fault):  # what runs elsewhere stays where it is
+                if job.config.resume == "never" and not launcher.is_basic and folder.has_started:
+                    print(f"the run that was here is kept as {folder.put_aside()}")
+                with folder.held():
+                    adopt(folder.path, sweep.path)
         with publishing(sweep, jobs[0].config.tracking, outputs, shown, others) as journal:
             was_finished = sweep.status == "FINISHED"
             journal.resume()

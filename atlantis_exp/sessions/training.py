@@ -27,6 +27,7 @@ from atlantis_exp.sessions.stopping import StopRequest, sweep_goes_on
 from atlantis_exp.tracking.publishing import catch_up, publishing
 from atlantis_exp.training.checkpoint import unforged
 from atlantis_exp.training.forecast import Forecast, forecast
+from atlantis_exp.training.plan import Counters
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Outcome, Trainer
 
@@ -90,17 +91,13 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
         raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
     if config.resume == "must" and not folder.has_started:
         raise ConfigError(f"resume=must: there is no run {folder.name} under {job.outputs / 'runs'}")
-    parent = folder.parent
-    # Slurm's next try of a job is no new run.
-    if config.resume == "never" and folder.has_started and os.environ.get("SLURM_RESTART_COUNT", "0") == "0":
-        kept = next(
-            path for n in range(1, 10_000) if not (path := folder.path.with_name(f"{folder.name}~{n}")).exists()
-        )
-        with folder.held():
-            folder.path.rename(kept)
+    # A sweep's launcher has put aside what was there, and its next try of a job, as Slurm's, is no new run.
+    is_first = job.launcher is None and os.environ.get("SLURM_RESTART_COUNT", "0") == "0"
+    if config.resume == "never" and is_first and folder.has_started:
+        parent = folder.parent
+        print(f"the run that was here is kept as {folder.put_aside()}")
         if parent is not None:
             adopt(folder.path, parent)
-        print(f"the run that was here is kept as {kept}")
     if (result := folder.ended(config.budget.steps)) is None:
         if folder.has_lost_checkpoints:
             raise Fault(
@@ -139,17 +136,21 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
     with terminal.working("reading the checkpoint and the replay memory"):
         state = trainer.checkpoints.load(trainer.memory, progress.say)
     folder.write_config(to_dict(config))
-    with unforged(folder.checkpoints):
-        steps_done = 0 if state is None else int(state["counters"]["steps"])
+    done = Counters()
+    if state is not None:
+        with unforged(folder.checkpoints):
+            done = Counters(steps=int(state["counters"]["steps"]), episodes=int(state["counters"]["episodes"]))
+            if not 0 <= done.episodes <= done.steps < 2**53:
+                raise ValueError(f"{done.episodes} episodes in {done.steps} steps")
     if state is None:
         if (weights := _initial_weights(config)) is not None:
             trainer.learner.begin_with(weights)
         progress.say(f"starting run {folder.name} in {folder.path}{_changed_plugins(config, folder)}")
     else:
-        progress.say(f"continuing run {folder.name} at step {steps_done:,}")
+        progress.say(f"continuing run {folder.name} at step {done.steps:,}")
     if config.budget.forecast != "off":
         # Before there is anything to publish: MLflow's import at the same time took three quarters of the speed.
-        _check_forecast(trainer, config, steps_done, progress)
+        _check_forecast(trainer, config, done, progress)
     if state is None:
         env = config.env
         flops = trainer.learner.update_flops((env.stack, env.size, env.size), config.training.batch_size)
@@ -160,7 +161,7 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
         with unforged(folder.checkpoints), terminal.working("playing the games up to where they were"):
             trainer.load_state_dict(state)
     if lost := trainer.checkpoints.lost:
-        journal.tags({LOST: f"{lost:,} observations of the replay memory, at step {steps_done:,}"})
+        journal.tags({LOST: f"{lost:,} observations of the replay memory, at step {done.steps:,}"})
     facts = {
         "device": str(trainer.learner.device),
         "precision": str(trainer.learner.dtype).removeprefix("torch."),
@@ -196,7 +197,7 @@ def _changed_plugins(config: Config, folder: RunFolder) -> str:
     return ""
 
 
-def expected(trainer: Trainer, config: Config, steps_done: int) -> Forecast:
+def expected(trainer: Trainer, config: Config, done: Counters) -> Forecast:
     """What the rest of a training will cost here; its parts are as before afterwards."""
     return forecast(
         trainer,
@@ -204,13 +205,13 @@ def expected(trainer: Trainer, config: Config, steps_done: int) -> Forecast:
         max_bytes=config.replay.max_bytes,
         size=config.env.size,
         stack=config.env.stack,
-        steps_done=steps_done,
+        done=done,
     )
 
 
-def _check_forecast(trainer: Trainer, config: Config, steps_done: int, progress: Progress) -> None:
+def _check_forecast(trainer: Trainer, config: Config, done: Counters, progress: Progress) -> None:
     with terminal.working("measuring how fast it goes here"):
-        cost = expected(trainer, config, steps_done)
+        cost = expected(trainer, config, done)
     progress.say(str(cost))
     if cost.shortage is not None:
         if config.budget.forecast == "refuse":

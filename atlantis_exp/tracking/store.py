@@ -31,7 +31,7 @@ from pydantic import AliasChoices, Field, TypeAdapter
 
 from atlantis_exp import terminal
 from atlantis_exp.runs.files import ARTIFACT, SMALL, is_whole, open_file, read_file, write_file
-from atlantis_exp.runs.folder import COMMIT, CONFIG, RESULT, TRACEBACK
+from atlantis_exp.runs.folder import COMMIT, CONFIG, LOOKS, RESULT, TRACEBACK
 from atlantis_exp.runs.journal import (
     Artifact,
     Commit,
@@ -73,12 +73,14 @@ _PAGES = 1_000  # of 1,000 runs each, that a server may list
 _POINTS = 500  # a call at least, where there are so many: fewer cost more each
 _PIXELS = 4_096  # a side, of a picture: a file of some kilobytes can unpack to gigabytes
 _PARAM_LENGTH = 6_000  # characters that MLflow keeps
+_IDENTITY, _FOLDER = "atlantis.identity", "atlantis.folder"  # tags: which run this is, and where it was published from
 _RUN_NAME = "mlflow.runName"
+_NAME_LENGTH = 250  # characters of a run's name that a PostgreSQL store takes
 _PRIMARY = "published.json"
 
 ORIGIN = "origin.json"
 """Where a folder that was brought from a server notes how far it is one with the run there."""
-SMALL_FILES = (CONFIG, RESULT, TRACEBACK)
+SMALL_FILES = (CONFIG, RESULT, TRACEBACK, LOOKS)
 """The small files that a run folder may hold besides its `commit.json`."""
 FILES_TAG = "atlantis.standing"
 """The tag of a run whose folder is on the server as of a commit: `files_digest` of its small files."""
@@ -136,7 +138,7 @@ class Store:
                     run.info.run_id,
                     run.info.run_name,
                     run.info.status,
-                    Path(run.data.tags["atlantis.folder"]),
+                    Path(run.data.tags[_FOLDER]),
                     run.data.params,
                     run.data.tags,
                 )
@@ -181,11 +183,12 @@ class Store:
 
     def open_run(self, folder: Path, commit: Commit) -> str:
         """Returns the id of the run that mirrors a folder; makes the run if it is not there."""
-        same = f"tags.`atlantis.identity` = '{commit.identity}'"
+        same = f"tags.`{_IDENTITY}` = '{commit.identity}'"
         if found := self.client.search_runs([self.experiment_id], same, max_results=1):
             return str(found[0].info.run_id)
-        tags = {"atlantis.identity": commit.identity, "atlantis.folder": str(folder), **commit.labels}
-        name = commit.labels.get(_RUN_NAME, folder.name)
+        labels = _labels(commit)
+        tags = {_IDENTITY: commit.identity, _FOLDER: str(folder), **labels}
+        name = labels.get(_RUN_NAME, folder.name)
         return str(self.client.create_run(self.experiment_id, commit.started, tags, name).info.run_id)
 
     def run(self, run_id: str) -> "Run | None":
@@ -455,7 +458,8 @@ def publish(folder: Path, store: Store, is_primary: bool = True) -> bool:
         cursor = Cursor.of(note, folder, store, commit)
         if cursor.files == files_digest(files):
             return False
-        if (run := store.run(cursor.run_id)) is None:  # somebody has deleted it, and here it went on
+        run = store.run(cursor.run_id)
+        if run is None or run.data.tags.get(_IDENTITY) != commit.identity:  # deleted, and here it went on, or another's
             Cursor(store.address, commit.identity).save(note)
             cursor = Cursor.of(note, folder, store, commit)
             run = store.client.get_run(cursor.run_id)
@@ -497,6 +501,11 @@ def _note(folder: Path, store: Store, is_primary: bool) -> Path:
     if is_primary or primary is None or primary.store == store.address:
         return folder / _PRIMARY
     return folder / f"published-{sha256(store.address.encode()).hexdigest()[:8]}.json"
+
+
+def _labels(commit: Commit) -> dict[str, str]:
+    """What a run is shown by, its name no longer than a store takes."""
+    return {key: text[:_NAME_LENGTH] if key == _RUN_NAME else text for key, text in commit.labels.items()}
 
 
 def small_files(folder: Path, commit: Commit, is_server: bool = True) -> dict[str, bytes]:
@@ -557,8 +566,11 @@ class Cursor:
         """Returns the folder's cursor in this store, at the start of a found or new run if there is none."""
         cursor = cls.read(note)
         if cursor is None or (cursor.store, cursor.identity) != (store.address, commit.identity):
-            if cursor is not None and cursor.store == store.address and cursor.run_id and store.run(cursor.run_id):
-                store.delete_run(cursor.run_id)  # it shows lines that the journal has taken back
+            if cursor is not None and cursor.store == store.address and cursor.run_id:
+                run = store.run(cursor.run_id)
+                # Of another folder it would be somebody else's, named by a note that was copied or made up.
+                if run and (run.data.tags.get(_IDENTITY), run.data.tags.get(_FOLDER)) == (cursor.identity, str(folder)):
+                    store.delete_run(cursor.run_id)  # it shows lines that the journal has taken back
             cursor = cls(store.address, commit.identity)
             cursor.save(note)  # should MLflow be out of reach, `unfinished` tells others where it is to go
         if not cursor.run_id:
@@ -643,7 +655,7 @@ class _Mirror:
             self._client.update_run(self._run_id, commit.status)
         else:
             self._client.set_terminated(self._run_id, commit.status, commit.updated)
-        tags = {**commit.labels, "resumable": str(commit.status in ("KILLED", "FAILED")).lower()}
+        tags = {**_labels(commit), "resumable": str(commit.status in ("KILLED", "FAILED")).lower()}
         if parent_run:
             tags["mlflow.parentRunId"] = parent_run
         if commit.error:

@@ -5,7 +5,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -154,10 +154,14 @@ class Checkpoints:
         """Restore the segments behind the last damaged one, and return them."""
         whole: list[dict[str, Any]] = []
         contents: list[dict[str, Any]] = []
-        with suppress(*_DAMAGED):
+        try:
             for entry in reversed(segments):
                 contents.insert(0, self._read(entry["name"], entry["sha256"]))
                 whole.insert(0, entry)
+        except CheckpointError:  # a RuntimeError, too
+            raise
+        except _DAMAGED:
+            pass
         if not segments:
             raise ValueError("it has no segment of the replay memory")
         oldest_id, next_id = int(segments[0]["since"]), int(segments[-1]["next_id"])

@@ -13,6 +13,7 @@ import numpy as np
 import psutil
 
 from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.training.plan import Counters
 from atlantis_exp.training.trainer import Trainer
 
 _WARM_MEMORY = 512 * 2**20  # bytes that torch and its thread buffers grow by once they work
@@ -71,12 +72,13 @@ def forecast(
     max_bytes: int,
     size: int,
     stack: int,
-    steps_done: int,
+    done: Counters,
 ) -> Forecast:
     """Time emulation, acting and learning with a trainer's parts, which are as before afterwards.
 
     Its emulators have yet to begin, or to be brought back to, an episode. capacity in observations, max_bytes of the
-    replay memory, size in pixels; the memory that is measured is a throwaway one.
+    replay memory, size in pixels; the memory that is measured is a throwaway one. What is left in episodes is taken to
+    be as long as those that are done, or as the game's usual ones.
     """
     plan, learner, emulators = trainer.plan, trainer.learner, trainer.emulators
     num_envs = emulators.num_envs
@@ -106,13 +108,15 @@ def forecast(
         update_seconds = _median_seconds(update, at_least=3, seconds=1.0)
     emulators.reset(range(num_envs), [0] * num_envs)  # a console that has not played
 
-    length = plan.length * (1 if plan.unit == "steps" else emulators.game.episode_steps)
+    usual = 1 if plan.unit == "steps" else emulators.game.episode_steps
+    each = done.steps / plan.done(done) if plan.done(done) else usual
+    length = done.steps + round((plan.length - plan.done(done)) * each)
     epsilon = statistics.fmean(plan.epsilon(progress, int(progress * length)) for progress in np.linspace(0, 1, 101))
     acts = 1 - epsilon**num_envs  # share of the iterations in which any environment asks the network
     seconds_a_step = (play_seconds + acts * act_seconds) / num_envs + update_seconds / plan.learn_every
-    steps = max(1, (length if trainer.max_steps is None else min(length, trainer.max_steps)) - steps_done)
+    steps = max(1, (length if trainer.max_steps is None else min(length, trainer.max_steps)) - done.steps)
     an_observation = memory.nbytes / (memory.next_id - memory.oldest_id)  # bytes
-    replay_bytes = int(min(max_bytes, min(capacity, steps_done + steps) * an_observation))
+    replay_bytes = int(min(max_bytes, min(capacity, done.steps + steps) * an_observation))
     there = trainer.memory.next_id - trainer.memory.oldest_id  # in a run that goes on, read already
     more_bytes = max(0, replay_bytes - int(there * an_observation))
     weights = sum(tensor.nbytes for tensor in learner.network.state_dict().values())

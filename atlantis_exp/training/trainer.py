@@ -154,7 +154,7 @@ class Trainer:
             yield sampler.sample(self.memory, self.plan.batch_size, self.sampling)
 
     def _feed_back(self) -> None:
-        """Report earlier TD errors to their samplers; the actor has already synchronised the device."""
+        """Report earlier TD errors to their samplers; where chance took every decision, this waits for the device."""
         for sampler, ids, errors in self._errors:
             sampler.feed_back(ids, errors.cpu().numpy())
         self._errors.clear()
@@ -211,6 +211,7 @@ class Trainer:
         outcome: Outcome = "finished" if self.plan.done(self.counters) >= self.plan.length else "budget"
         if not self.has_ended or self.recorder.evaluation_pending:
             outcome = "interrupted"
+        self.counters.seconds = time.monotonic() - self._session_start
         self.recorder.end(self.counters, outcome)
         self.commit()
         return outcome

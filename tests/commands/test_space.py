@@ -32,6 +32,7 @@ from atlantis_exp.commands.space import check_space, read_space
         ("tag(log, int(interval(1, 64)))", IntDistribution(1, 64, log=True)),
         ("range(1, 10, 3)", IntDistribution(1, 7, step=3)),
         ("range(10, 1, -3)", IntDistribution(4, 10, step=3)),
+        ("range(1, 1000000000000)", IntDistribution(1, 999_999_999_999)),
         ("range(0.25, 1.25, 0.25)", FloatDistribution(0.25, 1.0, step=0.25)),
     ],
 )
@@ -48,6 +49,7 @@ def test_a_space_is_written_as_for_hydras_optuna_sweeper(text: str, drawn: BaseD
         ("", "optimizer.lr=interval(2,1)", "`low <= high` must hold"),
         ("", "optimizer.lr=tag(log,interval(0,1))", "`low > 0` must hold"),
         ("", "optimizer.lr=range(1,1)", "there is no number in it"),
+        ("", "optimizer.lr=range(0,1,1e-9)", "more than 100,000 numbers; write interval(a, b)"),
         ("", "optimizer.lr=0.1", "no set of values; write choice"),
         ("", "model=glob(*)", "no set of values; write choice"),
         ("", "seed=0,1", "not to be searched"),

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import itertools
 import json
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -582,6 +583,8 @@ def test_the_same_question_of_more_seeds_is_the_same_comparison_and_remembers_it
         error = run(code=1)
         assert error.startswith(f"atlantis_exp: {path} is no record of this comparison's looks (")
         assert "Traceback" not in error
+    path.unlink()
+    assert run(code=1).startswith(f"atlantis_exp: {path} is gone: restore it, for without it the error of the looks")
     path.write_text(whole)
     run("delta=5%")
     assert len(list((tmp_path / "comparisons").iterdir())) == 2
@@ -640,6 +643,30 @@ def test_a_question_in_another_order_is_the_same_comparison(
 
 
 @pytest.mark.usefixtures("_undrawn")
+def test_keys_in_another_order_are_the_same_comparison(
+    record_seeds: Callable[..., list[Path]], run: Run, tmp_path: Path
+) -> None:
+    for model, score in (("cnn", 5_000.0), ("resnet", 3_000.0)):
+        for device, less in (("cpu", 0.0), ("cuda", 1_000.0)):
+            record_seeds(model, score - less, device=device)
+    sentence = "By device: cpu plays better than cuda by 1,000 points"
+    assert sentence in run("by=model,device")
+    spent = (the_folder(tmp_path) / "looks.json").read_bytes()
+    assert sentence in run("by=device,model")
+    assert (the_folder(tmp_path) / "looks.json").read_bytes() == spent
+
+
+@pytest.mark.usefixtures("_undrawn")
+def test_groups_may_have_names_that_are_no_names_of_files(
+    record_seeds: Callable[..., list[Path]], run: Run, tmp_path: Path
+) -> None:
+    for device, score in (("../a", 5e3), ("./a", 4e3), ("\u00fc", 3e3)):
+        record_seeds("cnn", score, device=device)
+    assert "../a plays better than ./a by 1,000 points" in run("by=device")
+    assert the_folder(tmp_path).name.startswith("a-vs-.-a-vs-")
+
+
+@pytest.mark.usefixtures("_undrawn")
 def test_a_baseline_is_named_as_the_tables_name_it(record_seeds: Callable[..., list[Path]], run: Run) -> None:
     for alpha, score in ((0.4, 5_000.0), (0.6, 3_000.0)):
         for folder in record_seeds("cnn", score):
@@ -649,6 +676,18 @@ def test_a_baseline_is_named_as_the_tables_name_it(record_seeds: Callable[..., l
     said = run("by=samplers.prioritized.alpha", "baseline=alpha=0.4")
     assert "alpha=0.6 plays worse than alpha=0.4 by 2,000 points" in said
     assert "alpha=0.6 plays worse than alpha=0.4" in run("by=samplers.prioritized.alpha", "baseline=0.4")
+
+
+@pytest.mark.usefixtures("_undrawn")
+def test_a_baseline_that_is_none_or_several_is_refused(record_seeds: Callable[..., list[Path]], run: Run) -> None:
+    for lr, eps in itertools.product((0.001, 0.002), repeat=2):
+        for folder in record_seeds("cnn", 1e6 * lr + 1e5 * eps):
+            config = json.loads((folder / "config.json").read_text())
+            config["optimizer"] |= {"lr": lr, "eps": eps}
+            (folder / "config.json").write_text(json.dumps(config))
+    assert run("by=optimizer.lr", "baseline=", code=2).startswith("atlantis_exp: baseline=: no such group; ")
+    error = run("by=optimizer.lr,optimizer.eps", "baseline=0.001", code=2)
+    assert error == "atlantis_exp: baseline=0.001: could be any of eps=0.001, lr=0.001"
 
 
 @pytest.mark.usefixtures("_undrawn")

@@ -90,6 +90,9 @@ def in_process() -> SerialEmulators:
     return SerialEmulators(make, NUM_ENVS)
 
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
+
+
 @pytest.fixture(scope="module")
 def two_workers() -> Iterator[ProcessEmulators]:
     with ProcessEmulators(make, NUM_ENVS, workers=2) as emulators:
@@ -222,10 +225,20 @@ def test_what_make_raises_is_raised() -> None:
 
 def test_workers_leave_signals_to_the_parent(two_workers: ProcessEmulators) -> None:
     two_workers.reset(range(NUM_ENVS))
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2):
+    for number in SIGNALS:
         for pid in workers_of_this_process():
             os.kill(pid, number)
         two_workers.step([0] * NUM_ENVS)
+
+
+def test_workers_leave_signals_to_the_parent_from_their_start_on() -> None:
+    before = workers_of_this_process()
+    with ProcessEmulators(make, NUM_ENVS, workers=2) as emulators:
+        for number in SIGNALS:
+            for pid in workers_of_this_process() - before:
+                os.kill(pid, number)
+        assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & set(SIGNALS)
+        assert emulators.reset(range(NUM_ENVS)).any()
 
 
 PARENT = """

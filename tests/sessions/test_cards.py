@@ -1,5 +1,6 @@
 """Folders of exported weights: how they play, what is packed, and what is refused."""
 
+import dataclasses
 import hashlib
 import json
 from collections.abc import Callable
@@ -141,6 +142,13 @@ def test_weights_are_packed_in_half_precision_only_above_eight_megabytes() -> No
     arrays = safetensors.numpy.load(packed)
     assert arrays["w"].dtype == np.float16
     assert arrays["n"].tolist() == [3]
+
+
+def test_a_card_names_weights_that_lay_here_without_a_place(tiny: Compose) -> None:
+    config = tiny()
+    for place, name in ((".", "weights"), ("/", "weights"), ("../best", "best")):
+        begun = dataclasses.replace(config.training, weights=f"{place}@{16 * '0'}")
+        assert portable(dataclasses.replace(config, training=begun)).training.weights == f"{name}@{16 * '0'}"
 
 
 def test_a_card_holds_nothing_of_the_machine_and_all_of_the_science(tiny: Compose) -> None:

@@ -245,6 +245,9 @@ def test_the_same_question_is_the_same_decision_however_it_is_written(asking: As
         "optimizer.lr=0.001,0.002 budget.steps=1_000_000 threads=2 tracking=mlflow",
     ):
         assert asking(*line.split()).folder == one.folder
+    several = ("model=cnn,resnet", "optimizer.lr=0.001,0.002")
+    assert asking(*several).folder == asking(*reversed(several)).folder
+    assert asking(*several).comparing == asking(*reversed(several)).comparing
     for line in ("budget.steps=2_000_000", "budget.steps=1_000_000 seeds=20", "budget.steps=1_000_000 delta=5%"):
         assert asking("optimizer.lr=0.001,0.002", *line.split()).folder != one.folder
 

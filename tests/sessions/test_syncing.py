@@ -174,6 +174,24 @@ def test_runs_go_to_a_server_and_come_back_equal_and_once_and_then_what_is_new(
     assert sent.count(f"{commit.offset:012d}.gz") == 1
 
 
+def test_the_looks_of_a_comparison_travel_with_it(tmp_path: Path, server: tuple[str, Path]) -> None:
+    address, cluster, laptop = server[0], tmp_path / "cluster", tmp_path / "laptop"
+    place = Path("comparisons/a-vs-b-0123456789")
+    journal = Journal(cluster / place, {"mlflow.runName": "a-vs-b"})
+    (cluster / place / "looks.json").write_text('{"model": []}')
+    journal.metrics({"difference/a over b": 1.0}, 0)
+    commit = journal.state_dict()
+    journal.commit()
+    journal.status("FINISHED")
+    for looks in ('{"model": []}', '{"model": [{"error": 0.0125}]}'):
+        (cluster / place / "looks.json").write_text(looks)
+        synced(cluster, f"to={address}", "tracking.experiment=looks")
+        synced(laptop, f"from={address}", "tracking.experiment=looks")
+        assert (laptop / place / "looks.json").read_text() == looks
+        journal.load_state_dict(commit)  # compared again
+        journal.status("FINISHED")
+
+
 @pytest.mark.slow
 def test_a_run_goes_on_where_it_is_and_its_copy_is_nobodys_to_end_or_replace(
     tmp_path: Path, server: tuple[str, Path], capsys: pytest.CaptureFixture[str]

@@ -33,6 +33,7 @@ from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.tracking.store import Store, publish
 from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.forecast import Forecast
+from atlantis_exp.training.plan import Counters
 from atlantis_exp.training.trainer import Trainer
 
 Compose = Callable[..., Config]
@@ -50,9 +51,9 @@ def test_the_forecast_is_measured_before_there_is_anything_for_mlflow(
     config = tiny(*SHORT, "tracking=mlflow", "budget.forecast=warn")
     folder, seen = RunFolder.of(config), []
 
-    def measured(_: Trainer, *, steps_done: int, **__: float) -> Forecast:
+    def measured(_: Trainer, *, done: Counters, **__: float) -> Forecast:
         time.sleep(0.5)  # for a publisher that would begin
-        seen.append((folder.state, folder.status, (tmp_path / "mlflow.lock").exists(), steps_done))
+        seen.append((folder.state, folder.status, (tmp_path / "mlflow.lock").exists(), done.steps))
         return Forecast(1, 40, 0, 1, 0, 1)
 
     monkeypatch.setattr("atlantis_exp.sessions.training.forecast", measured)

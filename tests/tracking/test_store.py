@@ -328,6 +328,37 @@ def test_a_run_that_goes_back_behind_what_was_published_replaces_it(
     assert rows(root, listed + " GROUP BY source_run_id", replaced, run_id(tmp_path)) == [(run_id(tmp_path), 2)]
 
 
+def test_a_note_that_was_made_up_costs_no_other_run_its_place_in_the_store(
+    tmp_path: Path, root: Path, store: Store
+) -> None:
+    theirs, ours = tmp_path / "theirs", tmp_path / "ours"
+    a_full_journal(theirs)
+    publish(theirs, store)
+    before = everything(root, theirs)
+    journal = Journal(ours)
+    journal.metrics({"score": 1}, 1)
+    commit(journal)
+    identity = read_commit(ours).identity  # type: ignore[union-attr]
+    note = json.loads((theirs / "published.json").read_text())
+    for made_up in ({"identity": "another"}, {}, {"identity": identity}):  # to be deleted, twice, and to be written to
+        (ours / "published.json").write_text(json.dumps({**note, **made_up, "offset": 0, "files": ""}))
+        publish(ours, store)
+        assert everything(root, theirs) == before
+        assert points(root, ours) == journaled_points(ours)
+        assert run_id(ours) != run_id(theirs)
+
+
+def test_a_name_is_cut_to_what_a_database_takes(tmp_path: Path, root: Path, store: Store) -> None:
+    journal = Journal(tmp_path, {"mlflow.runName": "s" * 300})
+    for score in (1, 2):
+        journal.metrics({"score": score}, score)
+        commit(journal)
+        publish(tmp_path, store)
+        told = everything(root, tmp_path)
+        assert told["name"] == "s" * 250
+        assert ("mlflow.runName", "s" * 250) in told["tags"]
+
+
 def test_a_folder_published_to_another_store_starts_anew_there_and_stays_here(
     tmp_path: Path, root: Path, store: Store
 ) -> None:

@@ -138,8 +138,9 @@ def test_what_cannot_be_read_now_is_no_damage(
     assert (state["step"], said) == (2, [])
 
 
+@pytest.mark.parametrize("error", [PermissionError(13, "no"), MemoryError()])
 def test_what_cannot_be_read_now_is_no_damage_either_where_something_else_is(
-    two_generations: Path, monkeypatch: pytest.MonkeyPatch
+    two_generations: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
     (oldest, *_) = [name for name in files_of(two_generations) if name.startswith("segments/")]
     (two_generations / oldest).write_bytes(b"")
@@ -149,7 +150,7 @@ def test_what_cannot_be_read_now_is_no_damage_either_where_something_else_is(
 
         def refused(path: Path, most: int, whole: int = whole, files: Iterator[int] = files) -> bytes:
             if next(files) >= whole:
-                raise MemoryError
+                raise error
             return read_file(path, most)
 
         monkeypatch.setattr(checkpoint, "read_file", refused)

@@ -1,6 +1,7 @@
 """What is expected of a training: measured on its own parts, which are as before afterwards."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from atlantis_exp.runs.journal import Journal
 from atlantis_exp.training import forecast as forecast_module
 from atlantis_exp.training.fingerprint import fingerprint, history
 from atlantis_exp.training.forecast import Forecast, forecast
-from atlantis_exp.training.plan import Phase
+from atlantis_exp.training.plan import Counters, Phase
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Trainer
 
@@ -37,7 +38,7 @@ def timed(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
 
 
 def expected_of(trainer: Trainer, size: int, **chosen: Any) -> Forecast:
-    asked = {"capacity": 120, "max_bytes": 2**22, "steps_done": trainer.counters.steps}
+    asked = {"capacity": 120, "max_bytes": 2**22, "done": trainer.counters}
     return forecast(trainer, size=size, stack=4, **{**asked, **chosen})
 
 
@@ -89,7 +90,7 @@ def test_a_real_training_is_none_the_wiser_of_forecasts_at_its_start_and_when_it
     with second.emulators:
         state = second.checkpoints.load(second.memory)
         assert state is not None
-        expected_of(second, size, steps_done=60)  # by parts that have yet to be brought to where they were
+        expected_of(second, size, done=Counters(steps=60))  # by parts that have yet to be brought to where they were
         second.load_state_dict(state)
         second.run()
         assert fingerprint(second.state_dict(), second.memory, tmp_path / "with") == fingerprint(
@@ -104,9 +105,15 @@ def test_what_is_left_is_expected_of_a_training(small: Callable[..., Trainer], t
     assert whole.steps == 160
     assert whole.steps_per_second == pytest.approx(1 / seconds_a_step)
     assert whole.hours == pytest.approx(160 * seconds_a_step / 3600)
-    assert expected_of(trainer, 8, steps_done=100).steps == 60
-    assert expected_of(small(tmp_path, max_steps=50), 8, steps_done=20).steps == 30
-    assert expected_of(trainer, 8, steps_done=500).steps == 1
+    assert expected_of(trainer, 8, done=Counters(steps=100)).steps == 60
+    assert expected_of(small(tmp_path, max_steps=50), 8, done=Counters(steps=20)).steps == 30
+    assert expected_of(trainer, 8, done=Counters(steps=500)).steps == 1
+    trainer.plan = replace(trainer.plan, unit="episodes")
+    assert expected_of(trainer, 8).steps == 160 * trainer.emulators.game.episode_steps
+    for episodes, left in ((40, 120), (159, 1), (160, 0)):  # which have been longer than the game's usual ones
+        done = Counters(steps=5_000 * episodes, episodes=episodes)
+        assert expected_of(trainer, 8, done=done).steps == max(1, 5_000 * left)
+    trainer.plan = replace(trainer.plan, unit="steps")
     assert expected_of(trainer, 8, max_bytes=1_000).memory == 1_000 + 2**29
     weights = sum(tensor.nbytes for tensor in trainer.learner.network.state_dict().values())
     for due, evaluations in (

@@ -1,6 +1,7 @@
 import dataclasses
 import itertools
 import shutil
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,9 @@ from atlantis_exp.game.vector import WorkerDied
 from atlantis_exp.learning.schedules import Linear
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.replay.samplers import Draw, PrioritizedSampler, Sampler, TopHalfSampler, UniformSampler
-from atlantis_exp.runs.journal import Metrics, read
+from atlantis_exp.runs.journal import NOTE, Metrics, Tags, read
 from atlantis_exp.training.actor import ConstantActor
+from atlantis_exp.training.evaluation import Evaluation
 from atlantis_exp.training.fingerprint import fingerprint
 from atlantis_exp.training.plan import Phase
 from atlantis_exp.training.recorder import Diverged
@@ -401,3 +403,22 @@ def test_a_run_goes_on_after_its_worker_was_killed(tiny: Compose, started: Start
     continued = started(config, tmp_path / "broken")
     continued.run()
     assert print_of(continued, tmp_path / "broken") == print_of(unbroken, tmp_path / "unbroken")
+
+
+def test_the_description_counts_the_hours_of_the_last_evaluation_too(
+    small: Small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trainer = small(tmp_path, evaluate_steps=None, evaluate_episodes=None, evaluate_at_end=True, max_steps=80)
+    played, late, clock = trainer.recorder._evaluate, 0.0, time.monotonic
+
+    def an_hour(*asked: Any) -> Evaluation:
+        nonlocal late
+        late += 3600
+        return played(*asked)
+
+    monkeypatch.setattr("time.monotonic", lambda: clock() + late)
+    monkeypatch.setattr(trainer.recorder, "_evaluate", an_hour)
+    assert trainer.run() == "budget"
+    tags = [record.values for _, record in read(tmp_path) if isinstance(record, Tags)]
+    assert " 1.00 hours" in [values[NOTE] for values in tags if NOTE in values][-1]
+    assert round(trainer.counters.seconds / 3600, 2) == 1

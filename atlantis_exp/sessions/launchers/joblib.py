@@ -55,7 +55,7 @@ def _shared_cores(launcher: Launcher, trainings: Sequence[Job]) -> Iterator[None
 def train_apart(job: Job) -> None:
     """Train in a process of its own. Raises: Fault where the run fails."""
     config, folder = job.config, RunFolder.of(job.config)
-    if config.resume != "never" and folder.ended(config.budget.steps) is not None:
+    if folder.ended(config.budget.steps) is not None:
         return
     if not sweep_goes_on(folder, job.launcher)():
         raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
