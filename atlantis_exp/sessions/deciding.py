@@ -114,7 +114,8 @@ class _Session:
         configs: dict[str, dict[str, Any]] = {}
         trained: dict[str, tuple[str, ...]] = {}  # by the name of the run
         groups = []
-        for chosen, job in jobs.items():
+        for chosen in request.contenders:  # of which two may be written alike
+            job = jobs[chosen]
             group = Group(values_in(facts_of[chosen], question.by), {})
             if group.label in contenders:
                 raise ConfigError(f"{' '.join(chosen)}: the same contender as {' '.join(contenders[group.label][0])}")
