@@ -199,7 +199,7 @@ def test_a_store_that_is_none_is_one_line(tmp_path: Path, free_port: Callable[[]
     (tmp_path / "mlflow.db").write_bytes(b"no database" * 1_000)
     command = (*COMMAND, f"port={free_port()}", f"paths.outputs={tmp_path}")
     ended = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stdout) == (1, "")
+    assert ended.returncode == 1
     assert ended.stderr == (
         f"atlantis_exp: sqlite:///{tmp_path}/mlflow.db cannot be opened: file is not a database; without that file "
         "sync makes it again\n"
