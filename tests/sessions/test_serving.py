@@ -201,8 +201,8 @@ def test_a_store_that_is_none_is_one_line(tmp_path: Path, free_port: Callable[[]
     ended = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
     assert ended.stderr == (
-        f"atlantis_exp: sqlite:///{tmp_path}/mlflow.db cannot be opened: file is not a database; without that file "
-        "sync makes it again\n"
+        f"atlantis_exp: sqlite:///{tmp_path}/mlflow.db cannot be opened: DatabaseError: file is not a database; "
+        "without that file sync makes it again\n"
     )
 
 
