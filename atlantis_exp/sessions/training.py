@@ -139,7 +139,7 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
     done = Counters()
     if state is not None:
         with unforged(folder.checkpoints):
-            done = Counters(steps=int(state["counters"]["steps"]), episodes=int(state["counters"]["episodes"]))
+            done = Counters.of(state["counters"])
             if not 0 <= done.episodes <= done.steps < 2**53:
                 raise ValueError(f"{done.episodes} episodes in {done.steps} steps")
     if state is None:

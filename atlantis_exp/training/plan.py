@@ -1,8 +1,8 @@
 """What is trained when, and how often it is written down."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Literal, Self
 
 from atlantis_exp.learning.schedules import Schedule
 from atlantis_exp.replay.memory import Returns
@@ -21,6 +21,11 @@ class Counters:
     random: int = 0  # decisions that chance took
     learn_ticks: int = 0  # multiples of learn_every that have passed
     seconds: float = 0.0
+
+    @classmethod
+    def of(cls, saved: Mapping[str, Any]) -> Self:
+        """Counters as a checkpoint has them. Raises: KeyError."""
+        return cls(**{field.name: saved[field.name] for field in fields(cls)})
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Any, Literal
 
 import numpy as np
@@ -85,7 +85,7 @@ class Trainer:
 
     def commit(self) -> None:
         """Make the checkpoint and all metrics up to it durable together, then visible."""
-        self.counters.seconds = time.monotonic() - self._session_start
+        self._take_time()
         self.recorder.refuse_divergence()
         self.checkpoints.save(self.state_dict(), self.memory)
         self.recorder.tracker.commit()
@@ -107,7 +107,7 @@ class Trainer:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self.counters = Counters(**{field.name: state["counters"][field.name] for field in fields(Counters)})
+        self.counters = Counters.of(state["counters"])
         self.learner.load_state_dict(state["learner"])
         self.emulators.load_state_dict(state["emulators"])
         self.stack.load_state_dict(state["stack"])
@@ -195,12 +195,15 @@ class Trainer:
             cadence.evaluate_episodes, episodes_before, counters.episodes
         ):
             self._evaluate(stop)
-        counters.seconds = time.monotonic() - self._session_start
+        self._take_time()
         self.recorder.show(counters)
         # Last: what else falls due at this step would be missing from a run that continues here.
         overdue = time.monotonic() - self._last_commit >= cadence.commit_seconds
         if overdue or passed(cadence.commit_episodes, episodes_before, counters.episodes):
             self.commit()
+
+    def _take_time(self) -> None:
+        self.counters.seconds = time.monotonic() - self._session_start
 
     def _evaluate(self, stop: Callable[[], bool]) -> None:
         self.recorder.evaluate(self.counters, self.emulators.num_envs, self.has_ended, stop)
@@ -211,7 +214,7 @@ class Trainer:
         outcome: Outcome = "finished" if self.plan.done(self.counters) >= self.plan.length else "budget"
         if not self.has_ended or self.recorder.evaluation_pending:
             outcome = "interrupted"
-        self.counters.seconds = time.monotonic() - self._session_start
+        self._take_time()
         self.recorder.end(self.counters, outcome)
         self.commit()
         return outcome

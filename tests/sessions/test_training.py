@@ -31,7 +31,7 @@ from atlantis_exp.sessions.training import train
 from atlantis_exp.sessions.verifying import Session, fingerprints, run_and_kill, start, train_and_kill
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.tracking.store import Store, publish
-from atlantis_exp.training.checkpoint import Checkpoints
+from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints
 from atlantis_exp.training.forecast import Forecast
 from atlantis_exp.training.plan import Counters
 from atlantis_exp.training.trainer import Trainer
@@ -403,6 +403,17 @@ def test_a_full_disk_is_one_clear_line_and_costs_nothing_committed(tiny: Compose
     unbroken = tiny(*chosen)
     train(Job(unbroken))
     assert fingerprints(config, small_disk) == fingerprints(unbroken, Path(unbroken.paths.outputs))
+
+
+@pytest.mark.parametrize("forged", [{"steps": 10**400}, {"steps": 1}, {"episodes": -1}, {"steps": "many"}])
+def test_counters_that_no_training_comes_to_are_one_line(
+    tiny: Compose, monkeypatch: pytest.MonkeyPatch, forged: dict[str, Any]
+) -> None:
+    """Before anything is expected of them."""
+    saved = {**dataclasses.asdict(Counters(steps=80, episodes=2)), **forged}
+    monkeypatch.setattr(Checkpoints, "load", lambda *_: {"counters": saved})
+    with pytest.raises(CheckpointError, match=r"is none of this training \((ValueError|TypeError): "):
+        train(Job(tiny(*SHORT, "budget.forecast=warn")))
 
 
 @pytest.fixture
