@@ -55,6 +55,11 @@ def listed(words: Sequence[str]) -> str:
     return f"{', '.join(words[:-1])} and {words[-1]}"
 
 
+def of_the_reports_protocol(model: str) -> list[RunFolder]:
+    """A network's trainings by a hundredth of the report's protocol."""
+    return [run for run, folder in KEPT if folder == "reproduction" and run.name.startswith(f"{model}-")]
+
+
 def section_of(heading: str) -> str:
     """What the page has under a heading, up to the next one."""
     return RESULTS.read_text().partition(f"# {heading}\n")[2].partition("\n#")[0]
@@ -94,11 +99,27 @@ def test_a_kept_run_is_still_the_run_of_its_config_and_in_the_table_of_its_page(
 
 def test_how_far_apart_the_seeds_of_the_reports_protocol_are_is_said_as_their_scores_say_it() -> None:
     page = " ".join((DOCS / "reproduction.md").read_text().split())
-    scores = [run.result.evaluation["evaluation/mean"] for run, of in KEPT if of == "reproduction" and run.result]
+    scores = [evaluated(run).scores.mean() for run in of_the_reports_protocol("cnn")]
     low, high = mean_interval(scores)
     assert f"the 95 % interval of their mean, {np.mean(scores):,.0f}, is {low:,.0f} to {high:,.0f}" in page
     apart = f"{min(scores):,.0f} to {max(scores):,.0f}, with a standard deviation of {np.std(scores, ddof=1):,.0f}"
     assert apart in page
+
+
+def test_what_resnet_dqn_does_by_the_reports_protocol_is_said_as_its_run_says_it() -> None:
+    page = " ".join((DOCS / "reproduction.md").read_text().split())
+    (run,) = of_the_reports_protocol("resnet")
+    assert run.result is not None
+    ended, share = run.result.counts["episodes"], run.result.evaluation["actions/favourite_share"]
+    assert f"ended it after {ended:.0f} of its 200 episodes" in page
+    mean = evaluated(run).scores.mean()
+    assert mean < min(evaluated(other).scores.mean() for other in of_the_reports_protocol("cnn"))
+    assert f"this one has {mean:,.0f} points, {mean / 20_873:.0%} of".replace("%", " %") in page
+    assert f"NOOP in {share:.1%} of its decisions".replace("%", " %") in page
+    assert f"Of the points {run.result.evaluation['evaluation/score_wave_bonus']:,.0f} are wave bonuses" in page
+    with run.artifact("episodes.csv").open() as file:
+        scores = [float(row["score"]) for row in csv.DictReader(file)]
+    assert f"the last 20 episodes have a mean of {np.mean(scores[-20:]):,.0f}" in page
 
 
 def test_survival_and_rate_of_the_longer_trainings_are_said_as_their_games_say_them() -> None:
