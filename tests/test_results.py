@@ -45,6 +45,12 @@ def of_the_verdict(sampler: str, model: str = "cnn", precision: str = "fp32") ->
     return {config.seed: run for run, config in configs if config.training.precision == precision}
 
 
+def metrics_of(run: RunFolder, name: str) -> list[float]:
+    """A metric's values over a training."""
+    records = (record.values for record in run.records() if isinstance(record, Metrics))
+    return [values[name] for values in records if name in values]
+
+
 def mean_and_iqm(games: EpisodeTable) -> str:
     """The scores as the tables show them."""
     return f"{games.scores.mean():,.0f} ({interquartile_mean(games.scores):,.0f})"
@@ -97,8 +103,20 @@ def test_a_kept_run_is_still_the_run_of_its_config_and_in_the_table_of_its_page(
     assert re.search(row, PAGES[folder].read_text(), re.MULTILINE)
 
 
+def test_how_long_the_trainings_by_the_reports_protocol_took_is_said_as_they_say_it() -> None:
+    runs = [run for run, folder in KEPT if folder == "reproduction"]
+    for run in runs:
+        assert run.result is not None
+        counts = run.result.counts
+        cells = (
+            f"{run.result.steps:,} | {counts['updates']:,.0f} | {counts['hours']:.2f} | {mean_and_iqm(evaluated(run))}"
+        )
+        assert f"| {run.trained_config.seed} | {cells} |" in PAGES["reproduction"].read_text()
+    assert len(runs) == 4
+
+
 def test_how_far_apart_the_seeds_of_the_reports_protocol_are_is_said_as_their_scores_say_it() -> None:
-    page = " ".join((DOCS / "reproduction.md").read_text().split())
+    page = " ".join(PAGES["reproduction"].read_text().split())
     scores = [evaluated(run).scores.mean() for run in of_the_reports_protocol("cnn")]
     low, high = mean_interval(scores)
     assert f"the 95 % interval of their mean, {np.mean(scores):,.0f}, is {low:,.0f} to {high:,.0f}" in page
@@ -107,19 +125,27 @@ def test_how_far_apart_the_seeds_of_the_reports_protocol_are_is_said_as_their_sc
 
 
 def test_what_resnet_dqn_does_by_the_reports_protocol_is_said_as_its_run_says_it() -> None:
-    page = " ".join((DOCS / "reproduction.md").read_text().split())
+    readme, page = (" ".join(page.read_text().split()) for page in (REPOSITORY / "README.md", PAGES["reproduction"]))
     (run,) = of_the_reports_protocol("resnet")
     assert run.result is not None
-    ended, share = run.result.counts["episodes"], run.result.evaluation["actions/favourite_share"]
-    assert f"ended it after {ended:.0f} of its 200 episodes" in page
-    mean = evaluated(run).scores.mean()
-    assert mean < min(evaluated(other).scores.mean() for other in of_the_reports_protocol("cnn"))
-    assert f"this one has {mean:,.0f} points, {mean / 20_873:.0%} of".replace("%", " %") in page
-    assert f"NOOP in {share:.1%} of its decisions".replace("%", " %") in page
-    assert f"Of the points {run.result.evaluation['evaluation/score_wave_bonus']:,.0f} are wave bonuses" in page
-    with run.artifact("episodes.csv").open() as file:
-        scores = [float(row["score"]) for row in csv.DictReader(file)]
-    assert f"the last 20 episodes have a mean of {np.mean(scores[-20:]):,.0f}" in page
+    played, mean = run.result.evaluation, evaluated(run).scores.mean()
+    others = [evaluated(other).scores.mean() for other in of_the_reports_protocol("cnn")]
+    assert mean < min(others)
+    random = runpy.run_path(str(DOCS / "tables.py"))["RANDOM"]
+    for sentence in (
+        f"ended it after {run.result.counts['episodes']:.0f} of its 200 episodes",
+        f"with epsilon at {metrics_of(run, 'actions/epsilon')[-1]:.2f} instead of {0.02 + 0.88 * np.exp(-2):.2f}",
+        f"this one has {mean:,.0f} points, {100 * mean / random:.0f} % of the random player's",
+        f"chooses NOOP in {100 * played['actions/favourite_share']:.1f} % of its decisions",
+        f"Of the points {played['evaluation/score_wave_bonus']:,.0f} are wave bonuses",
+        f"the last 20 episodes have a mean of {metrics_of(run, 'score/mean_20')[-1]:,.0f}",
+    ):
+        assert sentence in page
+    firing = sum(played[f"actions/{action}"] for action in ("FIRE", "RIGHTFIRE", "LEFTFIRE"))
+    assert 3 / 4 * played["actions/random_share"] / firing > 0.9  # three of four random actions fire
+    assert "more than nine in ten of its shots are random" in page
+    assert f"trainings of DQNCnn have {listed([f'{other:,.0f}' for other in others])} points" in readme
+    assert f"collapsed to NOOP, {mean:,.0f}; a random player has {random:,}" in readme
 
 
 def test_survival_and_rate_of_the_longer_trainings_are_said_as_their_games_say_them() -> None:
@@ -177,11 +203,7 @@ def test_what_rewards_to_a_power_score_is_said_as_their_games_say_it() -> None:
     assert run.result is not None
     games = evaluated(run)
     assert games.truncated.all()
-    *_, hours = (
-        record.values["throughput/hours"]
-        for record in run.records()
-        if isinstance(record, Metrics) and "throughput/hours" in record.values
-    )
+    *_, hours = metrics_of(run, "throughput/hours")
     mean, minutes = f"{games.scores.mean():,.0f}", f"{60 * hours:.0f} minutes on two cores"
     readme, results = (" ".join(page.read_text().split()) for page in (REPOSITORY / "README.md", RESULTS))
     low, high = games.scores.min(), games.scores.max()
@@ -363,8 +385,7 @@ def test_what_resnet_fast_scores_with_either_sampler_is_said_as_its_games_say_it
     (there,) = (float(row["mean"]) for row in rows if row["seed"] == "4")
     assert f"yet the two differ by {evaluated(run).scores.mean() - there:,.0f} points" in RESULTS.read_text()
     begun = [float(row["mean"]) for row in printed if row["kind"] == "training" and row["seed"] == "4"][:3]
-    records = (record.values for record in run.records() if isinstance(record, Metrics))
-    assert set(begun) <= {values["score/mean_20"] for values in records if "score/mean_20" in values}
+    assert set(begun) <= {*metrics_of(run, "score/mean_20")}
 
 
 def test_published_curves_are_quoted_as_they_are() -> None:
