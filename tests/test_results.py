@@ -202,25 +202,36 @@ def test_the_pace_of_trainings_with_other_rewards_is_said_as_their_games_say_it(
 
 
 def test_what_rewards_to_a_power_score_is_said_as_their_games_say_it() -> None:
-    (run,) = [run for run, of in KEPT if of == "rewards" and run.trained_config.objective.reward_exponent < 1]
-    assert run.result is not None
-    games = evaluated(run)
-    assert games.truncated.all()
-    *_, hours = metrics_of(run, "throughput/hours")
-    mean, minutes = f"{games.scores.mean():,.0f}", f"{60 * hours:.0f} minutes on two cores"
+    trained = [run for run, of in KEPT if of == "rewards" and run.trained_config.objective.reward_exponent < 1]
+    runs = sorted(trained, key=lambda run: run.trained_config.seed)
+    assert [run.trained_config.seed for run in runs] == [0, 1]
+    played = [evaluated(run) for run in runs]
+    assert all(games.truncated.all() for games in played)
+    scores = np.concatenate([games.scores for games in played])
+    means = listed([f"{games.scores.mean():,.0f}" for games in played])
+    minutes = listed([f"{60 * metrics_of(run, 'throughput/hours')[-1]:.0f}" for run in runs])
+    commands = listed([f"{60 * run.result.counts['hours']:.0f}" for run in runs if run.result is not None])
     readme, results = (" ".join(page.read_text().split()) for page in (REPOSITORY / "README.md", RESULTS))
-    low, high = games.scores.min(), games.scores.max()
-    assert f"{mean} points, all of a hundred games at the cap**, {low:,.0f} to {high:,.0f}, after {minutes};" in results
-    assert f"with its games the command took {60 * run.result.counts['hours']:.0f}." in results
-    assert f"has **{mean}**" in readme
-    assert f"has **{mean}**" in results
+    capped = f"all of two hundred games at the cap**, {scores.min():,.0f} to {scores.max():,.0f}"
+    assert f"**{means} points, {capped}, after {minutes} minutes on two cores" in results
+    assert f"with their games the commands took {commands}." in results
+    assert f"have **{means}**" in readme
+    assert f"have **{means}**" in results
+    shares, clipped = (
+        [100 * hits["side_bomber"] / (hits["centre_bomber"] + hits["side_bomber"]) for hits, _ in map(hits_of, tables)]
+        for tables in (played, games_of_the_fields_game())
+    )
+    percent = [listed([f"{share:.0f}" for share in each]) for each in (shares, clipped)]
+    assert f"which shoot {percent[0]} % of the bombers it hits" in results
+    assert f"that is luck: {percent[1]} %" in results
 
     with (DOCS / "data" / "standard.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["step"] == "1000000" and row["evaluation"]]
     halfway = {row["run"].split("-")[2]: f"{float(row['evaluation']):,.0f}" for row in rows}
-    early = EpisodeTable.read(run.artifact(evaluation_at(1_000_000))).scores.mean()
+    halfway_here = [EpisodeTable.read(run.artifact(evaluation_at(1_000_000))).scores.mean() for run in runs]
+    early = listed([f"{mean:,.0f}" for mean in halfway_here])
     three = "{s0}, {s1} and {s2}".format(**halfway)
-    assert f"five games average {early:,.0f}, where the three have {three}." in results
+    assert f"five games average {early}, where the three have {three}." in results
     third = of_the_fields_game()[2]
     assert (
         f"had {halfway['s2']} in five games after a million steps and {training_at(third, 1_000_000)[0]:.2f}" in results
