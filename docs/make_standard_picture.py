@@ -1,8 +1,8 @@
 """Draw `docs/images/NAME.png` from `docs/data/NAME.csv`: scores in the field's game next to published curves.
 
-`python docs/make_standard_picture.py NAME [OUTPUTS...]`, from the root of the checkout, where NAME is `standard` or
-`million`. The trainings in the folders OUTPUTS enter the table first, in the place of what it has of runs of the same
-names.
+`python docs/make_standard_picture.py NAME [OUTPUTS...]`, from the root of the checkout, where NAME is `standard`,
+`rewards` or `million`. The trainings in the folders OUTPUTS enter the table first, in the place of what it has of runs
+of the same names.
 """
 
 import sys
@@ -20,7 +20,11 @@ from atlantis_exp.media import BLUE, GREY
 
 PUBLISHED = {"DreamerV3": "s", "QR-DQN Impala ResNet": "^", "QR-DQN Nature CNN": "v"}
 SEEDS = (("-", "o"), ("--", "X"), (":", "D"))  # line of training, mark of evaluations
-TRAINED = {"standard": "rewards of at most 1", "million": "rewards to the power of .25"}
+TRAINED = {
+    "standard": "rewards of at most 1",
+    "rewards": "rewards to the power of .25",
+    "million": "rewards to the power of .25",
+}
 FRAMES = 4  # a step
 
 

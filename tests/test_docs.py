@@ -15,6 +15,7 @@ DOCS = REPOSITORY / "docs"
 OF_DATA = {
     "fast": ("make_results_picture",),
     "standard": ("make_standard_picture", "standard"),
+    "rewards": ("make_standard_picture", "rewards"),
     "million": ("make_standard_picture", "million"),
 }
 
