@@ -51,6 +51,12 @@ def metrics_of(run: RunFolder, name: str) -> list[float]:
     return [values[name] for values in records if name in values]
 
 
+def ends_of(run: RunFolder) -> list[tuple[int, int]]:
+    """At which step each game of a training ended, and its length in steps."""
+    with run.artifact("episodes.csv").open() as file:
+        return [(int(row["step"]), int(row["length"])) for row in csv.DictReader(file)]
+
+
 def mean_and_iqm(games: EpisodeTable) -> str:
     """The scores as the tables show them."""
     return f"{games.scores.mean():,.0f} ({interquartile_mean(games.scores):,.0f})"
@@ -133,8 +139,7 @@ def test_what_resnet_dqn_does_by_the_reports_protocol_is_said_as_its_run_says_it
     assert mean < min(others)
     assert run.result.counts["episodes"] == 200
     earlier = EpisodeTable.read(run.artifact(evaluation_at(303_000)), SOURCES).scores
-    with run.artifact("episodes.csv").open() as file:
-        ended = sum(int(row["step"]) <= 303_000 for row in csv.DictReader(file))
+    ended = sum(step <= 303_000 for step, _ in ends_of(run))
     random = runpy.run_path(str(DOCS / "tables.py"))["RANDOM"]
     for sentence in (
         f"After {ended} episodes and 303,000 steps it had {earlier.mean():,.0f}",
@@ -208,6 +213,9 @@ def test_what_rewards_to_a_power_score_is_said_as_their_games_say_it() -> None:
     of_rewards = [run for run, of in KEPT if of == "rewards" and run.trained_config.env.id == "ALE/Atlantis-v5"]
     runs = sorted(of_rewards, key=lambda run: run.trained_config.seed)
     assert [run.trained_config.seed for run in runs] == [0, 1, 2]
+    assert {run.trained_config.objective.reward_exponent for run in runs} == {0.25}
+    drawn = [training_at(run, 1_250_000, "rewards")[0] for run in runs]
+    assert drawn == pytest.approx([metrics_of(run, "throughput/hours")[-1] for run in runs])
     played = [evaluated(run) for run in runs]
     assert all(games.truncated.all() for games in played)
     scores = np.concatenate([games.scores for games in played])
@@ -274,8 +282,7 @@ def test_what_four_million_steps_bring_is_said_as_their_games_say_it() -> None:
     ) in results
     early = np.sort(games.steps[~capped])[:-1]
     assert f"and {len(early)} of the others are over within their first {early.max():,.0f} steps" in results
-    with run.artifact("episodes.csv").open() as file:
-        ended = [(int(row["step"]), int(row["length"])) for row in csv.DictReader(file)]
+    ended = ends_of(run)
     num_envs, cap = run.trained_config.env.num_envs, games.steps.max()
     lost = [length for step, length in ended if step - num_envs * length >= 2_600_000 and length < cap]
     began = np.array([step for step, _ in ended if step > 2_600_000])  # where one ends the next one begins
