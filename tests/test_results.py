@@ -6,6 +6,7 @@ import re
 import runpy
 import shutil
 from collections.abc import Callable, Sequence
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -209,9 +210,16 @@ def test_the_pace_of_trainings_with_other_rewards_is_said_as_their_games_say_it(
     assert max(games.scores.mean() for games in in_the_reports_game) < min(games.scores.mean() for games in ten)
 
 
+def to_a_power(gamma: float) -> list[RunFolder]:
+    """The trainings in the field's game with other rewards and a discount, by seed."""
+    configs = [(run, run.trained_config) for run, folder in KEPT if folder == "rewards"]
+    of_the_game = [(run, config) for run, config in configs if config.env.id == "ALE/Atlantis-v5"]
+    runs = [(config.seed, run) for run, config in of_the_game if config.objective.gamma == gamma]
+    return [run for _, run in sorted(runs, key=itemgetter(0))]
+
+
 def test_what_rewards_to_a_power_score_is_said_as_their_games_say_it() -> None:
-    of_rewards = [run for run, of in KEPT if of == "rewards" and run.trained_config.env.id == "ALE/Atlantis-v5"]
-    runs = sorted(of_rewards, key=lambda run: run.trained_config.seed)
+    runs = to_a_power(gamma=0.99)
     assert [run.trained_config.seed for run in runs] == [0, 1, 2]
     assert {run.trained_config.objective.reward_exponent for run in runs} == {0.25}
     drawn = [training_at(run, 1_250_000, "rewards")[0] for run in runs]
@@ -255,6 +263,19 @@ def test_what_rewards_to_a_power_score_is_said_as_their_games_say_it() -> None:
     assert (
         f"had {halfway['s2']} in five games after a million steps and {training_at(third, 1_000_000)[0]:.2f}" in results
     )
+
+
+def test_what_a_longer_discount_scores_is_said_as_its_games_say_it() -> None:
+    (run,) = to_a_power(gamma=0.997)
+    here, others = pace_of(evaluated(run)), [pace_of(evaluated(other)) for other in to_a_power(gamma=0.99)]
+    assert evaluated(run).truncated.all()
+    assert here[-1] < min(other[-1] for other in others)
+    hits = [other[1] for other in others]
+    minutes = 60 * metrics_of(run, "throughput/hours")[-1]
+    text = " ".join(RESULTS.read_text().split())
+    assert f"{here[-1]:,.0f} points, all of a hundred games at the cap, after {minutes:.0f} minutes;" in text
+    assert f"the lowest of the three with .99 has {min(other[-1] for other in others):,.0f}." in text
+    assert f"{here[1]:.1f} against {min(hits):.1f} to {max(hits):.1f} times a thousand frames" in text
 
 
 def test_what_four_million_steps_bring_is_said_as_their_games_say_it() -> None:
