@@ -278,8 +278,16 @@ def test_what_a_longer_discount_scores_is_said_as_its_games_say_it() -> None:
     assert f"{here[1]:.1f} against {min(hits):.1f} to {max(hits):.1f} times a thousand frames" in text
 
 
+def longer_with_a_power(*, learned_on: bool) -> RunFolder:
+    """The longer training with rewards to a power, from random weights or from exported ones."""
+    configs = [(run, run.trained_config) for run, folder in KEPT if folder == "longer"]
+    of_a_power = [(run, config) for run, config in configs if config.objective.reward_exponent < 1]
+    (run,) = [run for run, config in of_a_power if (config.training.weights is not None) == learned_on]
+    return run
+
+
 def test_what_four_million_steps_bring_is_said_as_their_games_say_it() -> None:
-    (run,) = [run for run, of in KEPT if of == "longer" and run.trained_config.objective.reward_exponent < 1]
+    run = longer_with_a_power(learned_on=False)
     means = {(row["name"], row["frames"]): row["mean"] for row in curves(game_of("Atlantis-v0"))}
     steps = sorted(int(path.stem) for path in run.artifact("evaluation").glob("*.csv"))
     assert steps[-1] == 4_000_000
@@ -329,6 +337,42 @@ def test_what_four_million_steps_bring_is_said_as_their_games_say_it() -> None:
     sideways = sum(landed[f"{gun}_{ship}"] * pace.PAID[f"side_{ship}"] for gun, ship in GUNS_AND_SHIPS)
     most = (sideways + calm.points[:, -1].sum()) / calm.frames.sum()
     assert f"were all of its hits by side guns, it would have {most:.1f}." in results
+
+
+def test_what_a_falling_learning_rate_brings_is_said_as_its_games_say_it() -> None:
+    run = longer_with_a_power(learned_on=True)
+    readme, results = (" ".join(page.read_text().split()) for page in (REPOSITORY / "README.md", RESULTS))
+    config, games = run.trained_config, evaluated(run)
+    assert config.lr_schedule.name == "linear"
+    assert config.replay.capacity == config.budget.steps
+    before, _ = read_card(REPOSITORY / "pretrained" / "cnn_standard")
+    assert config.training.weights == f"pretrained/cnn_standard@{before.sha256[:16]}"
+    card, _ = read_card(REPOSITORY / "pretrained" / "cnn_annealed")
+    assert card.step == config.budget.steps
+    _, hits, side, *_ = pace_of(games)
+    assert f"stays what it was**, {hits:.1f} a thousand frames, {side:.0f} % by side guns" in results
+    hours = metrics_of(run, "throughput/hours")[-1]
+    assert f"| 0 | bf16, Xeon with AMX | {hours:.2f} | {games.truncated.sum():.0f} of {len(games.scores)} |" in results
+    ended, cap, num_envs = ends_of(run), int(games.steps.max()), config.env.num_envs
+    lost = [(step - num_envs * length, length) for step, length in ended if length < cap]
+    assert [began for began, _ in lost] == pytest.approx([num_envs * cap] * 2, abs=num_envs)
+    later = sum(step > num_envs * cap for step, _ in ended)  # where one ends the next one begins
+    assert (
+        f"two of the {num_envs} games that began at step {num_envs * cap:,} were over within "
+        f"{max(length for _, length in lost):,} steps, and of the {later} that began after these none."
+    ) in results
+
+    calm = EpisodeTable.read(DOCS / "longer" / "annealed_epsilon_0.001.csv", SOURCES)
+    mean, rate = calm.scores.mean(), calm.scores.sum() / calm.frames.sum()
+    assert calm.truncated.all()
+    assert len(calm.scores) == 100
+    for text in (readme, results):
+        assert f"**{mean:,.0f}**" in text
+        assert f" {np.mean(card.scores):,.0f} over {len(card.scores)}" in text
+    _, here = side_by_side(card, card.evaluation, calm.scores.tolist()).columns[2].cells
+    span = f"{calm.scores.min():,.0f} to {calm.scores.max():,.0f}"
+    assert f"**{mean:,.0f}** over 100 games (95 % interval {here}), {span}, {rate:.2f} points a frame" in results
+    assert f"{(calm.scores > 1_000_000).sum()} of them pass a million" in results
 
 
 def test_the_three_networks_in_bfloat16_are_set_side_by_side_as_their_runs_are() -> None:
