@@ -6,7 +6,6 @@ import re
 import runpy
 import shutil
 from collections.abc import Callable, Sequence
-from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +13,12 @@ import pytest
 
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.components import game_of
+from atlantis_exp.config import Config
 from atlantis_exp.decision import mean_interval
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.folder import RunFolder, all_runs, evaluation_at
 from atlantis_exp.runs.journal import Metrics, Tags
-from atlantis_exp.sessions.cards import read_card, side_by_side
+from atlantis_exp.sessions.cards import Card, read_card, side_by_side
 from atlantis_exp.statistics import interquartile_mean
 from benchmarks import pace
 
@@ -210,16 +210,21 @@ def test_the_pace_of_trainings_with_other_rewards_is_said_as_their_games_say_it(
     assert max(games.scores.mean() for games in in_the_reports_game) < min(games.scores.mean() for games in ten)
 
 
-def to_a_power(gamma: float) -> list[RunFolder]:
-    """The trainings in the field's game with other rewards and a discount, by seed."""
-    configs = [(run, run.trained_config) for run, folder in KEPT if folder == "rewards"]
-    of_the_game = [(run, config) for run, config in configs if config.env.id == "ALE/Atlantis-v5"]
-    runs = [(config.seed, run) for run, config in of_the_game if config.objective.gamma == gamma]
-    return [run for _, run in sorted(runs, key=itemgetter(0))]
+def to_a_power(folder: str) -> list[tuple[RunFolder, Config]]:
+    """The kept trainings in the field's game from rewards to a power, by seed."""
+    configs = [(run, run.trained_config) for run, of in KEPT if of == folder]
+    there = [(run, config) for run, config in configs if config.env.id == "ALE/Atlantis-v5"]
+    of_a_power = [(run, config) for run, config in there if config.objective.reward_exponent < 1]
+    return sorted(of_a_power, key=lambda each: each[1].seed)
+
+
+def with_a_discount(gamma: float) -> list[RunFolder]:
+    """Those of five million frames, with a discount."""
+    return [run for run, config in to_a_power("rewards") if config.objective.gamma == gamma]
 
 
 def test_what_rewards_to_a_power_score_is_said_as_their_games_say_it() -> None:
-    runs = to_a_power(gamma=0.99)
+    runs = with_a_discount(0.99)
     assert [run.trained_config.seed for run in runs] == [0, 1, 2]
     assert {run.trained_config.objective.reward_exponent for run in runs} == {0.25}
     drawn = [training_at(run, 1_250_000, "rewards")[0] for run in runs]
@@ -266,8 +271,9 @@ def test_what_rewards_to_a_power_score_is_said_as_their_games_say_it() -> None:
 
 
 def test_what_a_longer_discount_scores_is_said_as_its_games_say_it() -> None:
-    (run,) = to_a_power(gamma=0.997)
-    here, others = pace_of(evaluated(run)), [pace_of(evaluated(other)) for other in to_a_power(gamma=0.99)]
+    (run,) = with_a_discount(0.997)
+    assert run.trained_config.objective.reward_exponent == 0.25
+    here, others = pace_of(evaluated(run)), [pace_of(evaluated(other)) for other in with_a_discount(0.99)]
     assert evaluated(run).truncated.all()
     assert here[-1] < min(other[-1] for other in others)
     hits = [other[1] for other in others]
@@ -278,16 +284,14 @@ def test_what_a_longer_discount_scores_is_said_as_its_games_say_it() -> None:
     assert f"{here[1]:.1f} against {min(hits):.1f} to {max(hits):.1f} times a thousand frames" in text
 
 
-def longer_with_a_power(*, learned_on: bool) -> RunFolder:
-    """The longer training with rewards to a power, from random weights or from exported ones."""
-    configs = [(run, run.trained_config) for run, folder in KEPT if folder == "longer"]
-    of_a_power = [(run, config) for run, config in configs if config.objective.reward_exponent < 1]
-    (run,) = [run for run, config in of_a_power if (config.training.weights is not None) == learned_on]
-    return run
+def interval_next_to(card: Card, games: EpisodeTable) -> str:
+    """The interval of games' mean as `evaluate` shows it next to a card."""
+    _, here = side_by_side(card, card.evaluation, games.scores.tolist()).columns[2].cells
+    return str(here)
 
 
 def test_what_four_million_steps_bring_is_said_as_their_games_say_it() -> None:
-    run = longer_with_a_power(learned_on=False)
+    (run,) = [run for run, config in to_a_power("longer") if config.training.weights is None]
     means = {(row["name"], row["frames"]): row["mean"] for row in curves(game_of("Atlantis-v0"))}
     steps = sorted(int(path.stem) for path in run.artifact("evaluation").glob("*.csv"))
     assert steps[-1] == 4_000_000
@@ -329,8 +333,7 @@ def test_what_four_million_steps_bring_is_said_as_their_games_say_it() -> None:
         assert f"**{calm.scores.mean():,.0f}**" in text
     low, high, rate = calm.scores.min(), calm.scores.max(), calm.scores.sum() / calm.frames.sum()
     assert f"has **{calm.scores.mean():,.0f}**, {low:,.0f} to {high:,.0f}, {rate:.2f} points a frame" in results
-    _, here = side_by_side(card, card.evaluation, calm.scores.tolist()).columns[2].cells
-    assert f"The 95 % interval of this mean, {here}, holds a million;" in results
+    assert f"The 95 % interval of this mean, {interval_next_to(card, calm)}, holds a million;" in results
     assert f"{(calm.scores > 1_000_000).sum()} of the games pass it." in results
     assert f"costs {1 - np.mean(card.scores) / calm.scores.mean():.0%}." in results.replace(" %", "%")
     landed, _ = hits_of(calm)
@@ -340,15 +343,17 @@ def test_what_four_million_steps_bring_is_said_as_their_games_say_it() -> None:
 
 
 def test_what_a_falling_learning_rate_brings_is_said_as_its_games_say_it() -> None:
-    run = longer_with_a_power(learned_on=True)
+    ((run, config),) = [each for each in to_a_power("longer") if each[1].training.weights is not None]
     readme, results = (" ".join(page.read_text().split()) for page in (REPOSITORY / "README.md", RESULTS))
-    config, games = run.trained_config, evaluated(run)
+    games = evaluated(run)
     assert config.lr_schedule.name == "linear"
     assert config.replay.capacity == config.budget.steps
     before, _ = read_card(REPOSITORY / "pretrained" / "cnn_standard")
     assert config.training.weights == f"pretrained/cnn_standard@{before.sha256[:16]}"
     card, _ = read_card(REPOSITORY / "pretrained" / "cnn_annealed")
-    assert card.step == config.budget.steps
+    assert (card.run, card.step) == (run.name, config.budget.steps)
+    assert f"weights={card.weights} to=pretrained/cnn_annealed" in results
+    assert f"with {before.reached['hours']:.1f} and {card.reached['hours']:.1f} hours of training" in results
     _, hits, side, *_ = pace_of(games)
     assert f"stays what it was**, {hits:.1f} a thousand frames, {side:.0f} % by side guns" in results
     hours = metrics_of(run, "throughput/hours")[-1]
@@ -369,7 +374,7 @@ def test_what_a_falling_learning_rate_brings_is_said_as_its_games_say_it() -> No
     for text in (readme, results):
         assert f"**{mean:,.0f}**" in text
         assert f" {np.mean(card.scores):,.0f} over {len(card.scores)}" in text
-    _, here = side_by_side(card, card.evaluation, calm.scores.tolist()).columns[2].cells
+    here = interval_next_to(card, calm)
     span = f"{calm.scores.min():,.0f} to {calm.scores.max():,.0f}"
     assert f"**{mean:,.0f}** over 100 games (95 % interval {here}), {span}, {rate:.2f} points a frame" in results
     assert f"{(calm.scores > 1_000_000).sum()} of them pass a million" in results
