@@ -4,7 +4,6 @@ The runs are ordinary ones, and the looks are those of `compare` over them, whos
 moment, the same command goes on where it was.
 """
 
-import re
 import subprocess
 import sys
 import tempfile
@@ -30,7 +29,7 @@ from atlantis_exp.decision import detectable, equivalence, looks_up_to
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import Journal, Metrics, NullJournal
+from atlantis_exp.runs.journal import Journal, NullJournal
 from atlantis_exp.sessions.job import Job, command_line, labels, quoted, replaced
 from atlantis_exp.sessions.page import opened, terminable
 from atlantis_exp.sessions.sweep import ledger
@@ -332,40 +331,16 @@ def _spread(contest: Contest) -> tuple[float, str] | None:
 
 
 def _write(journal: Journal, contest: Contest, comparison: Comparison) -> None:
-    """Write to the page the looks that it does not have yet, what they spent, and what is known now."""
-    there = {
-        (record.step, key)
-        for record in contest.folder.records()
-        if isinstance(record, Metrics)
-        for key in record.values
-    }
-    rows = []
-    for answer in comparison.answers:
-        spent = 0.0
-        for look in answer.decision.looks:
-            spent += look.error
-            values = {f"error_spent/{answer.family.name}": spent}
-            for verdict in look.verdicts:
-                pair = f"{verdict.group} over {verdict.other}"
-                for name in ("difference", "low", "high"):
-                    values[f"{name}/{answer.family.name}/{pair}"] = getattr(verdict, name)
-                rows.append(
-                    f"| {look.size} | {pair} | {verdict.said} | {verdict.difference:,.0f} "
-                    f"| {verdict.low:,.0f} to {verdict.high:,.0f} | {look.error:.2%} |"
-                )
-            named = {_metric(name): value for name, value in values.items()}
-            if new := {key: value for key, value in named.items() if (look.size, key) not in there}:
-                journal.metrics(new, look.size)
+    """Write to the page the looks that were taken and what is known now."""
+    table = ["| look at seeds | pair | said | difference | interval | error spent |", f"|{' --- |' * 6}"] + [
+        f"| {look.size} | {verdict.group} over {verdict.other} | {verdict.said} | {verdict.difference:,.0f} "
+        f"| {verdict.low:,.0f} to {verdict.high:,.0f} | {look.error:.2%} |"
+        for answer in comparison.answers
+        for look in answer.decision.looks
+        for verdict in look.verdicts
+    ]
+    commands = [f"Continue or report: `{contest.command}`", f"Its runs again: `{contest.comparing}`"]
     journal.tags({"verdict": comparison.verdict})
-    head = ["| look at seeds | pair | said | difference | interval | error spent |", f"|{' --- |' * 6}"]
-    commands = f"Continue or report: `{contest.command}`\n\nIts runs again: `{contest.comparing}`"
-    table = "\n".join([*head, *rows]) if rows else ""
-    lines = [comparison.verdict, *comparison.others, *comparison.caveats, table, commands]
-    journal.note("\n\n".join(line for line in lines if line))
+    said = [comparison.verdict, *comparison.others, *comparison.caveats]
+    journal.note("\n\n".join([*said, "\n".join(table), *commands]))
     journal.flush()
-
-
-def _metric(name: str) -> str:
-    """Return a name in MLflow's alphabet: what is measured, of which family, of which pair."""
-    whole = "/".join(re.sub(r"[^A-Za-z0-9_. -]|^\W", "_", part) for part in name.split("/", 2))
-    return whole if len(whole) <= 250 else f"{whole[:240]} {digest({'name': name})[:8]}"

@@ -79,7 +79,6 @@ def test_runs_trained_by_processes_of_their_own_have_one_parent_and_a_repeated_s
     assert set(children.values()) == {sweeps[0][0]}
     note = tags(outputs, "mlflow.note.content")["sweep seed=0,1"]
     assert all(f"| {name} | done | 80 |" in note for name in children)
-    assert "| cnn uniform quick" in note  # the group of both
     page = next((outputs / "sweeps").glob("sweep-*")) / "artifacts"
     table = list(csv.DictReader((page / "runs.csv").open()))
     assert {line["run"] for line in table} == {job.config.run_name() for job in pair}
@@ -89,7 +88,6 @@ def test_runs_trained_by_processes_of_their_own_have_one_parent_and_a_repeated_s
         for job in pair:
             train(job)
     assert rows(outputs, "SELECT run_uuid, status FROM runs WHERE name = 'sweep seed=0,1'") == sweeps
-    assert len(list((page / "images").rglob("*.png"))) == 2
 
 
 def test_a_job_that_fails_is_shown_as_failed_with_its_error_and_so_is_its_sweep(pair: list[Job]) -> None:
