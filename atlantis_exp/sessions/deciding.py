@@ -67,8 +67,8 @@ class Contest:
         job_of: Callable[[tuple[str, ...]], Job],
         command: str,
     ) -> None:
-        self.several, self.command = several, command
-        self._fixed, self._launcher, self._job_of = fixed, launcher, job_of
+        self.several, self.launcher, self.command = several, launcher, command
+        self._fixed, self._job_of = fixed, job_of
         jobs = {each: job_of((*replaced(fixed, *each),)) for each in chosen}
         facts = {each: flatten(to_dict(job.config)) for each, job in jobs.items()}
         for key in question.by:
@@ -204,50 +204,30 @@ class Contest:
         """Return those of some seeds with which a contender has not been trained to its end."""
         return [seed for seed in seeds if not self._has_ended(self.run(label, seed))]
 
-    def train(self, needed: Mapping[str, Sequence[int]]) -> None:
-        """Train seeds of contenders, all contenders' first seed before their second ones. Raises: Fault."""
-        try:
-            if not self._launcher:
-                order = sorted((seed, at, label) for at, (label, seeds) in enumerate(needed.items()) for seed in seeds)
-                jobs = [self.job(label, seed) for seed, _, label in order]
-                with ledger(jobs, self.several, command=self.command):
-                    for job in jobs:
-                        if (late := train(job)) is not None:
-                            sys.exit(128 + late)
-            elif (
-                self.several and len(set(map(tuple, needed.values()))) == 1 and needed.keys() == self.contenders.keys()
-            ):
-                self._launch(next(iter(needed.values())), self.several)
-            else:
-                for label, seeds in needed.items():
-                    self._launch(seeds, self.contenders[label][0])
-            for label, seeds in needed.items():
-                for seed in self.left(label, seeds):
-                    raise Fault(f"run {self.run(label, seed).name} has not ended")
-        except Fault as fault:
-            raise Fault(f"{fault}; the decision goes on with: {self.command}", fault.exit_code) from fault
+    def jobs(self, needed: Mapping[str, Sequence[int]]) -> list[Job]:
+        """Return the trainings of seeds of contenders, all contenders' first seed before their second ones."""
+        order = sorted((seed, at, label) for at, (label, seeds) in enumerate(needed.items()) for seed in seeds)
+        return [self.job(label, seed) for seed, _, label in order]
 
-    def _launch(self, seeds: Sequence[int], chosen: Sequence[str]) -> None:
-        """Run a sweep by the launcher that was asked for. Raises: Fault."""
-        overrides = [f"seed={','.join(map(str, seeds))}", *replaced(self._fixed, *chosen)]
-        command = [sys.executable, "-m", "atlantis_exp", "train", "-m", *self._launcher, *overrides]
-        with subprocess.Popen(command) as sweep:
-            try:
-                code = sweep.wait()
-            except BaseException:
-                sweep.terminate()  # it has its jobs commit, and is waited for
-                raise
-        if code:
-            raise Fault(f"a sweep ended with exit code {code}", exit_code=code if code > 0 else 128 - code)
+    def sweeps(self, needed: Mapping[str, Sequence[int]]) -> list[list[str]]:
+        """Return the command lines of the sweeps in which a launcher trains them: one, if all need the same seeds."""
+        parts = [(seeds, self.contenders[label][0]) for label, seeds in needed.items()]
+        if self.several and needed.keys() == self.contenders.keys() and len({tuple(seeds) for seeds, _ in parts}) == 1:
+            parts = [(parts[0][0], tuple(self.several))]
+        return [
+            ["train", "-m", *self.launcher, f"seed={','.join(map(str, seeds))}", *replaced(self._fixed, *overrides)]
+            for seeds, overrides in parts
+        ]
 
 
-def decide(contest: Contest) -> None:
+def decide(contest: Contest, train: Callable[[Job], int | None] = train) -> None:
     """Train the contenders' seeds in the order of the plan, look, drop what is decided, and say the answer.
 
     Raises:
         Fault: a training fails; the same command goes on.
     """
     tracking = contest.config.tracking
+    again = f"the decision goes on with: {contest.command}"
     catch_up(contest.outputs, tracking.uri)
     shown = labels(
         f"decide {' '.join(contest.several) or ' against '.join(contest.contenders)}", run_colour("decide"), "decision"
@@ -261,11 +241,36 @@ def decide(contest: Contest) -> None:
                     _write(journal, contest, comparison)
                 if not (needed := contest.needed(comparison)):
                     break
-                contest.train(needed)
+                try:
+                    _train(contest, needed, train)
+                except Fault as fault:
+                    raise Fault(f"{fault}; {again}", fault.exit_code) from fault
     except (SystemExit, KeyboardInterrupt) as ended:
-        terminal.warn(f"the decision goes on with: {contest.command}")
+        terminal.warn(again)
         sys.exit(ended.code if isinstance(ended, SystemExit) else 130)
     print(f"its runs again: {contest.comparing}")
+
+
+def _train(contest: Contest, needed: Mapping[str, Sequence[int]], train: Callable[[Job], int | None]) -> None:
+    if contest.launcher:
+        for arguments in contest.sweeps(needed):
+            with subprocess.Popen([sys.executable, "-m", "atlantis_exp", *arguments]) as sweep:
+                try:
+                    code = sweep.wait()
+                except BaseException:
+                    sweep.terminate()  # it has its jobs commit, and is waited for
+                    raise
+            if code:
+                raise Fault(f"a sweep ended with exit code {code}", exit_code=code if code > 0 else 128 - code)
+    else:
+        jobs = contest.jobs(needed)
+        with ledger(jobs, contest.several, command=contest.command):
+            for job in jobs:
+                if (late := train(job)) is not None:
+                    sys.exit(128 + late)
+    for label, seeds in needed.items():
+        for seed in contest.left(label, seeds):
+            raise Fault(f"run {contest.run(label, seed).name} has not ended")
 
 
 def say_what_it_takes(contest: Contest) -> None:
