@@ -11,7 +11,7 @@ import os
 import re
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache, partial
 from itertools import accumulate
@@ -272,7 +272,7 @@ class Journal:
         if self._offset < self._commit.offset:
             self._mark(replace(self._commit, offset=self._offset))  # readers first: the bytes change under them next
         content = b"".join(self._lines)
-        _write_from(self._folder, self._offset, [content])
+        _write_from(self._folder, self._offset, content)
         self._offset += len(content)
         self._lines.clear()
         return {"offset": self._offset, "time": self._time}
@@ -366,25 +366,13 @@ def fitted(lines: Sequence[str], room: int, rest: str) -> str:
     return "\n".join(lines[:kept]) + more.format(len(lines) - kept)
 
 
-def restore(folder: Path, start: int, pieces: Iterable[bytes]) -> None:
-    """Continues a run folder's journal from an offset with bytes of another copy of it; `commit.json` makes them count.
-
-    The caller holds the folder, and what is committed in it ends at `start` or before.
-
-    Raises:
-        JournalError: on a journal that ends before `start`.
-    """
-    make_folder(folder)
-    _write_from(folder, start, pieces)
-
-
-def _write_from(folder: Path, start: int, pieces: Iterable[bytes]) -> None:
-    """Puts bytes, durably, in the place of all that a journal holds behind an offset. Raises: JournalError, OSError."""
+def _write_from(folder: Path, start: int, content: bytes) -> None:
+    """Put bytes, durably, in the place of all that a journal holds behind an offset. Raises: JournalError, OSError."""
     with open(folder / "journal.jsonl", "ab", opener=no_link) as file:
         if os.fstat(file.fileno()).st_size < start:  # truncating would fill the gap with zeros
             raise JournalError(f"{file.name} is shorter than its writer left it: it was cut or replaced since")
         file.truncate(start)
-        file.writelines(pieces)
+        file.write(content)
         file.flush()
         os.fsync(file.fileno())
 

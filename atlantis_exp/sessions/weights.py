@@ -10,7 +10,7 @@ from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints, to_sa
 def stored_weights(run: RunFolder, weights: str) -> tuple[bytes, int]:
     """A stored run's network as safetensors, and its step; weights: `latest` or `best`.
 
-    A folder without checkpoints, as one that was brought from a server, has the weights of its evaluations.
+    A folder without checkpoints, as one that was copied without them, has the weights of its evaluations.
 
     Raises:
         Fault: where the run has no such weights, or they are not those that were committed.
