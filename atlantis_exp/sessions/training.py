@@ -140,8 +140,6 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
     if state is not None:
         with unforged(folder.checkpoints):
             done = Counters.of(state["counters"])
-            if not 0 <= done.episodes <= done.steps < 2**53:
-                raise ValueError(f"{done.episodes} episodes in {done.steps} steps")
     if state is None:
         if (weights := _initial_weights(config)) is not None:
             trainer.learner.begin_with(weights)
