@@ -307,6 +307,8 @@ def build_trained_network(config: cfg.Config, weights: bytes) -> nn.Module:
             _architecture(config).load_state_dict(tensors, assign=True)
         network = build_network(config, "network")
         network.load_state_dict(tensors)
+        if not all(tensor.isfinite().all() for tensor in tensors.values()):
+            raise Fault("the weights are not all finite numbers: their training diverged, or they are damaged")
     except Fault:  # of a plugin
         raise
     except (SafetensorError, RuntimeError) as error:

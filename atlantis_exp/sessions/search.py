@@ -32,12 +32,12 @@ from atlantis_exp.checking import digest
 from atlantis_exp.config import TrackingConfig
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
-from atlantis_exp.runs.files import ARTIFACT, read_file
+from atlantis_exp.runs.files import ARTIFACT, own, read_file
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Metrics, adopt, fitted
+from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Metrics, adopt
 from atlantis_exp.runs.lock import alone
 from atlantis_exp.runs.provenance import provenance
-from atlantis_exp.sessions.job import Job, command_line, labels
+from atlantis_exp.sessions.job import Job, command_line, fitted, labels
 from atlantis_exp.sessions.space import Space, suggest
 from atlantis_exp.sessions.stopping import StopRequest
 from atlantis_exp.sessions.training import train
@@ -124,6 +124,7 @@ def _open(request: Request) -> "_Session":
         after = request.pruned_after
         file = folder.path / "trials.jsonl"
         try:
+            own(file)  # which Optuna writes where it is
             _mend(file)
             study = optuna.create_study(
                 storage=JournalStorage(JournalFileBackend(str(file))),

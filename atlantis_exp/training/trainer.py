@@ -108,6 +108,11 @@ class Trainer:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.counters = Counters.of(state["counters"])
+        due = self.counters.steps // self.plan.learn_every - self.counters.learn_ticks
+        if not 0 <= due <= self.emulators.num_envs:  # else the next step would make all these updates
+            raise ValueError(f"{due} updates are due")
+        if self.memory.highest_action >= len(self.emulators.game.actions):
+            raise ValueError(f"the replay memory holds action {self.memory.highest_action}, which the game lacks")
         self.learner.load_state_dict(state["learner"])
         self.emulators.load_state_dict(state["emulators"])
         self.stack.load_state_dict(state["stack"])
@@ -116,7 +121,9 @@ class Trainer:
         self.sampling.bit_generator.state = state["sampling"]
         for index, phase in enumerate(self.plan.phases):
             phase.sampler.load_state_dict(state["samplers"][str(index)])
-        self.scores, self.lengths = state["scores"], state["lengths"]
+        self.scores[:], self.lengths[:] = state["scores"], state["lengths"]
+        if not np.isfinite(self.scores).all():
+            raise ValueError("the scores are not finite")
         self.recorder.load_state_dict(state)
         for env in range(self.emulators.num_envs):
             if not self.memory.is_under_way(env):  # what came before in its episode was lost
