@@ -63,7 +63,7 @@ def margin(delta: str | float | None) -> tuple[float | None, bool]:
 def _list_out(arguments: list[str]) -> list[str]:
     """Let a list be written without brackets, as in `by=model,sampler`."""
     # Hydra itself would take the commas for a sweep, and a second `=` for a mistake.
-    return [re.sub(r"^(by|runs|where)=([^\[].*)$", _listed, argument) for argument in as_texts(arguments)]
+    return [re.sub(r"^(by|runs|where)=([^\[].*)$", listed, argument) for argument in as_texts(arguments)]
 
 
 def as_texts(arguments: Iterable[str]) -> list[str]:
@@ -71,7 +71,8 @@ def as_texts(arguments: Iterable[str]) -> list[str]:
     return [re.sub(r"^baseline=(?!null$)([^'\"]+)$", r"baseline='\1'", argument) for argument in arguments]
 
 
-def _listed(match: re.Match[str]) -> str:
+def listed(match: re.Match[str]) -> str:
+    """Return KEY=a,b of a match as KEY=['a','b']."""
     items = (f"'{item}'" for item in re.split(r",(?![^\[]*\])", match[2].replace("'", "")))
     return f"{match[1]}=[{','.join(items)}]"
 

@@ -22,7 +22,7 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.job import Job, command_line, labels, replaced
-from atlantis_exp.sessions.sweep import terminable
+from atlantis_exp.sessions.page import terminable
 from atlantis_exp.tracking.publishing import publishing
 from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.fingerprint import fingerprint

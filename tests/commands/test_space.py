@@ -86,6 +86,7 @@ def test_an_impossible_space_is_refused_in_one_line_before_anything_starts(
         ("space.optimizer=adam,rmsprop optimizer=adam,adamw", "optimizer=adam,rmsprop says something else"),
         ("modle=cnn optimizer=adam,rmsprop", "did you mean 'model'?"),
         ("optimizer=adam,rmsprop evaluation.at_end=false", "evaluation.at_end=false: a search compares"),
+        ("optimizer=adam,rmsprop seed=3", "seed=3: write 1_000 or more; decide tests the best values with seeds below"),
         ("space=optimzer", "did you mean 'optimizer'?"),
     ],
 )

@@ -17,14 +17,14 @@ import pytest
 from atlantis_exp.commands.app import Asked
 from atlantis_exp.commands.compare import VERB as COMPARE
 from atlantis_exp.commands.compare import CompareConfig
-from atlantis_exp.commands.decide import DecideConfig, request_of
+from atlantis_exp.commands.decide import DecideConfig, contest_of
 from atlantis_exp.commands.overrides import check, swept
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import _name as _metric_name
 from atlantis_exp.runs.journal import read_commit
-from atlantis_exp.sessions.deciding import _metric, _Session, decide
+from atlantis_exp.sessions.deciding import Contest, _metric, decide, say_what_it_takes
 from atlantis_exp.sessions.job import replaced
 from atlantis_exp.tracking.publishing import catch_up
 
@@ -38,18 +38,18 @@ CAPS = "env.max_steps=100,900"  # who plays longer scores more
 
 Compose = Callable[..., Config]
 Recorded = Callable[..., Path]
-Asking = Callable[..., _Session]
+Asking = Callable[..., Contest]
 
 
 @pytest.fixture
 def asking(tiny_overrides: tuple[str, ...], tmp_path: Path) -> Asking:
     """A decision as a command line asks for it: `asking("model=cnn,resnet")`."""
 
-    def asked(*words: str) -> _Session:
+    def asked(*words: str) -> Contest:
         typed = tuple(replaced(tiny_overrides, f"paths.outputs={tmp_path}", *words))
         several = swept(typed)
         ((texts, config),) = check("decide", DecideConfig, [text for text in typed if text not in several]).items()
-        return _Session.of(request_of(Asked(config, "decide", texts, typed=typed)))
+        return contest_of(Asked(config, "decide", texts, typed=typed))
 
     return asked
 
@@ -72,9 +72,9 @@ def deciding(tiny_overrides: tuple[str, ...], tmp_path: Path) -> Callable[..., s
     return start
 
 
-def seeds_of(session: _Session, label: str, most: int = 20) -> list[int]:
+def seeds_of(contest: Contest, label: str, most: int = 20) -> list[int]:
     """The seeds of a contender whose runs have ended."""
-    return [seed for seed in range(most) if session.done(label, seed)]
+    return sorted({*range(most)} - {*contest.left(label, range(most))})
 
 
 def looks(outputs: Path) -> dict[str, list[dict[str, object]]]:
@@ -94,11 +94,11 @@ def record_seeds(recorded: Recorded, first: float, seeds: range, *overrides: str
 def test_contenders_are_trained_level_until_a_look_decides_and_compare_says_the_same(
     asking: Asking, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    session = asking(*SHORT, CAPS)
-    decide(session.request)
+    contest = asking(*SHORT, CAPS)
+    decide(contest)
     printed = capsys.readouterr().out
     labels = ["max_steps=100", "max_steps=900"]
-    folders = [RunFolder.of(session.job(label, seed).config) for seed in range(5) for label in labels]
+    folders = [contest.run(label, seed) for seed in range(5) for label in labels]
     assert {path.name for path in (tmp_path / "runs").iterdir()} == {folder.name for folder in folders}
     began = {folder.name: (folder.path / "result.json").stat().st_mtime_ns for folder in folders}
     assert list(began) == sorted(began, key=began.__getitem__)  # seed 0 of both, seed 1 of both, ...
@@ -107,13 +107,13 @@ def test_contenders_are_trained_level_until_a_look_decides_and_compare_says_the_
     before = looks(tmp_path)
     assert [look["error"] for look in before["env.max_steps"]] == [0.05]
 
-    again = shlex.split(session.comparing)
-    assert f"its runs again: {session.comparing}" in printed
+    again = shlex.split(contest.comparing)
+    assert f"its runs again: {contest.comparing}" in printed
     assert again[:4] == ["python", "-m", "atlantis_exp", "compare"]
     COMPARE.run([*again[4:], "tracking=none"])
     assert answer in capsys.readouterr().out.splitlines()
     assert looks(tmp_path) == before
-    decide(session.request)
+    decide(contest)
     assert answer in capsys.readouterr().out.splitlines()
     assert looks(tmp_path) == before
     assert {name: (tmp_path / "runs" / name / "result.json").stat().st_mtime_ns for name in began} == began
@@ -127,11 +127,11 @@ def test_decided_pairs_are_dropped_and_the_page_in_mlflow_has_each_look_once(
     for label, score in rates.items():
         # Of those that are alike, nine of the ten seeds of the last look are there.
         record_seeds(recorded, score, range(5 if score > 5_000 else 9), f"optimizer.{label}")
-    session = asking("optimizer.lr=0.001,0.002,0.003", "tracking=mlflow")
-    assert list(session.contenders) == list(rates)
-    decide(session.request)
+    contest = asking("optimizer.lr=0.001,0.002,0.003", "tracking=mlflow")
+    assert list(contest.contenders) == list(rates)
+    decide(contest)
     printed = " ".join(capsys.readouterr().out.split())
-    assert [len(seeds_of(session, label)) for label in rates] == [5, 10, 10]
+    assert [len(seeds_of(contest, label)) for label in rates] == [5, 10, 10]
     assert [look["error"] for look in looks(tmp_path)["optimizer.lr"]] == [0.0125, pytest.approx(0.0375)]
     assert "lr=0.001 plays better than lr=0.002 by" in printed
     assert "Not decided: lr=0.002 against lr=0.003" in printed
@@ -146,7 +146,7 @@ def test_decided_pairs_are_dropped_and_the_page_in_mlflow_has_each_look_once(
         assert run.info.status == "FINISHED"
         assert run.data.tags["verdict"].startswith("lr=0.001 plays better than lr=0.002")
         assert "| 5 | lr=0.001 over lr=0.002 | better |" in run.data.tags["mlflow.note.content"]
-        assert session.comparing in run.data.tags["mlflow.note.content"]
+        assert contest.comparing in run.data.tags["mlflow.note.content"]
         return {
             key: [(point.step, point.value) for point in client.get_metric_history(run.info.run_id, key)]
             for key in run.data.metrics
@@ -162,7 +162,7 @@ def test_decided_pairs_are_dropped_and_the_page_in_mlflow_has_each_look_once(
         *(first[f"{name}/{pair}"] for name in ("low", "difference", "high")), strict=True
     ):
         assert low < difference < high
-    decide(session.request)
+    decide(contest)
     assert page() == first
 
 
@@ -173,8 +173,8 @@ def test_seeds_that_are_there_are_looked_at_without_a_training(
     for label, score in (("0.001", 9_000.0), ("0.002", 1_000.0), ("0.003", 1_000.0)):
         record_seeds(recorded, score, range(5 if score > 5_000 else 10), f"optimizer.lr={label}")
     before = set((tmp_path / "runs").iterdir())
-    session = asking("optimizer.lr=0.001,0.002,0.003")
-    decide(session.request)
+    contest = asking("optimizer.lr=0.001,0.002,0.003")
+    decide(contest)
     assert [len(look["seeds"]) for look in looks(tmp_path)["optimizer.lr"]] == [3, 2]  # type: ignore[arg-type]
     assert "would have been found with 80 %" in " ".join(capsys.readouterr().out.split())
     assert set((tmp_path / "runs").iterdir()) == before
@@ -190,12 +190,12 @@ def test_metrics_have_names_that_mlflow_takes_whatever_the_contenders_are_called
 def test_a_run_that_cannot_be_compared_is_named(asking: Asking, recorded: Recorded) -> None:
     record_seeds(recorded, 1_000, range(5), "model=cnn")
     record_seeds(recorded, 2_000, range(5), "model=resnet")
-    session = asking("model=cnn,resnet", "seeds=5")
-    run = RunFolder.of(session.job("resnet", 3).config)
+    contest = asking("model=cnn,resnet", "seeds=5")
+    run = contest.run("resnet", 3)
     (table,) = run.path.glob("artifacts/evaluation/*.csv")
     table.unlink()
     with pytest.raises(Fault, match=f"^run {run.name} has ended and cannot be compared; above it says why$"):
-        decide(session.request)
+        decide(contest)
 
 
 def test_a_run_that_was_trained_longer_than_is_asked_is_no_seed_of_the_question(
@@ -216,24 +216,24 @@ def test_a_training_that_fails_ends_the_decision_in_one_line_that_says_how_it_go
 ) -> None:
     record_seeds(recorded, 1_000, range(5), "model=cnn")
     record_seeds(recorded, 2_000, range(4), "model=resnet")
-    session = asking("model=cnn,resnet", "seeds=5")
-    run = RunFolder.of(session.job("resnet", 4).config)
+    contest = asking("model=cnn,resnet", "seeds=5")
+    run = contest.run("resnet", 4)
     run.path.mkdir(parents=True)
     (run.path / "checkpoints").write_text("in the way")
     with pytest.raises(Fault) as failed:
-        decide(session.request)
+        decide(contest)
     assert str(failed.value).startswith(f"run {run.name}: ")
-    assert str(failed.value).endswith(f"; the decision goes on with: {session.request.command}")
-    assert session.folder.status == "FAILED"
+    assert str(failed.value).endswith(f"; the decision goes on with: {contest.command}")
+    assert contest.folder.status == "FAILED"
 
 
 def test_the_command_that_compares_is_read_as_it_is_meant(asking: Asking, tmp_path: Path) -> None:
-    session = asking("optimizer.lr=0.001,0.002", "baseline='lr=0.001'", "delta=1234567")
-    words = shlex.split(session.comparing)[4:]
+    contest = asking("optimizer.lr=0.001,0.002", "baseline='lr=0.001'", "delta=1234567")
+    words = shlex.split(contest.comparing)[4:]
     (config,) = check("compare", CompareConfig, COMPARE.rewrite(words)).values()
-    assert config.question == session.request.question
+    assert config.question == contest.question
     assert config.question.delta == 1_234_567
-    assert config.at_epsilon == session.epsilon == 0.05
+    assert config.at_epsilon == 0.05
     assert config.paths.outputs == str(tmp_path)
 
 
@@ -252,8 +252,8 @@ def test_the_same_question_is_the_same_decision_however_it_is_written(asking: As
         assert asking("optimizer.lr=0.001,0.002", *line.split()).folder != one.folder
 
 
-def said(session: _Session, capsys: pytest.CaptureFixture[str]) -> str:
-    session.say_what_it_takes()
+def said(contest: Contest, capsys: pytest.CaptureFixture[str]) -> str:
+    say_what_it_takes(contest)
     return capsys.readouterr().out
 
 
@@ -291,7 +291,7 @@ def test_a_decision_that_was_killed_goes_on_and_ends_as_the_unbroken_one(
     deciding: Callable[..., subprocess.Popen[str]], asking: Asking, tmp_path: Path
 ) -> None:
     unbroken = asking(*SHORT, CAPS, f"paths.outputs={tmp_path / 'unbroken'}")
-    decide(unbroken.request)
+    decide(unbroken)
     runs = tmp_path / "o" / "runs"
     for number, ended, sent in ((1, -9, signal.SIGKILL), (4, 130, signal.SIGINT), (7, 143, signal.SIGTERM)):
         process = deciding(CAPS)
