@@ -19,22 +19,30 @@ from pydantic.dataclasses import dataclass
 from pydantic_core import PydanticKnownError
 
 from atlantis_exp.checking import check_server, check_time, digest, nearest, seconds, to_dict
-from atlantis_exp.components import KINDS, NAME, Component, Plugin, game_ids, game_of, known, title_of
+from atlantis_exp.components import (
+    KINDS,
+    NAME,
+    Component,
+    Count,
+    Plugin,
+    Positive,
+    Probability,
+    game_ids,
+    game_of,
+    known,
+    title_of,
+)
 from atlantis_exp.faults import ConfigError
 
 # Built when a config is parsed: all verbs' together take a tenth of a second.
 STRICT = ConfigDict(defer_build=True, strict=True, extra="forbid", allow_inf_nan=False)
 
-Count = Annotated[int, Field(ge=1, le=10**12)]
 Frameskip = Annotated[int, Field(ge=1, le=256)]
 _MOST_GAMES = 64  # that an evaluation plays side by side
 Episodes = Annotated[int, Field(ge=1, le=10**6)]  # of one evaluation
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Size = Annotated[int, Field(ge=8, le=210)]
-Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
-Probability = Annotated[float, Field(ge=0, le=1)]
-Share = Annotated[float, Field(gt=0, lt=1)]
 
 
 def _check_device(device: str) -> str:

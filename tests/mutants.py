@@ -18,7 +18,6 @@ import sys
 import tempfile
 import threading
 import time
-from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -38,11 +37,27 @@ MODULES = (
 ALSO = {"training.trainer": ("training.checkpoint",), "replay.memory": ("training.checkpoint",)}
 LEAST = 0.9  # of a module's mutants
 OPERATORS: dict[type[ast.AST], tuple[type[ast.AST], ...]] = {
-    **{ast.Lt: (ast.LtE, ast.GtE), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.LtE), ast.GtE: (ast.Gt, ast.Lt)},
-    **{ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,), ast.Is: (ast.IsNot,), ast.IsNot: (ast.Is,)},
-    **{ast.In: (ast.NotIn,), ast.NotIn: (ast.In,), ast.And: (ast.Or,), ast.Or: (ast.And,), ast.Add: (ast.Sub,)},
-    **{ast.Sub: (ast.Add,), ast.Mult: (ast.Div,), ast.Div: (ast.Mult,), ast.FloorDiv: (ast.Mult,)},
-    **{ast.Mod: (ast.Mult,), ast.Pow: (ast.Mult,), ast.BitAnd: (ast.BitOr,), ast.BitOr: (ast.BitAnd,)},
+    ast.Lt: (ast.LtE, ast.GtE),
+    ast.LtE: (ast.Lt, ast.Gt),
+    ast.Gt: (ast.GtE, ast.LtE),
+    ast.GtE: (ast.Gt, ast.Lt),
+    ast.Eq: (ast.NotEq,),
+    ast.NotEq: (ast.Eq,),
+    ast.Is: (ast.IsNot,),
+    ast.IsNot: (ast.Is,),
+    ast.In: (ast.NotIn,),
+    ast.NotIn: (ast.In,),
+    ast.And: (ast.Or,),
+    ast.Or: (ast.And,),
+    ast.Add: (ast.Sub,),
+    ast.Sub: (ast.Add,),
+    ast.Mult: (ast.Div,),
+    ast.Div: (ast.Mult,),
+    ast.FloorDiv: (ast.Mult,),
+    ast.Mod: (ast.Mult,),
+    ast.Pow: (ast.Mult,),
+    ast.BitAnd: (ast.BitOr,),
+    ast.BitOr: (ast.BitAnd,),
 }
 REMOVED = (ast.AugAssign, ast.Break, ast.Continue, ast.Delete, ast.For, ast.If, ast.Raise, ast.While)
 UNREAD = {"annotation", "returns", "decorator_list", "bases"}  # no behaviour, or the module's own
@@ -87,7 +102,11 @@ def changed(node: ast.AST, in_function: bool) -> Iterator[ast.AST]:
         new = copy.copy(node)
         new.test = ast.UnaryOp(ast.Not(), test)  # type: ignore[attr-defined]
         yield new
-    if isinstance(node, ast.Call) and len(node.args) > 1 and not any(isinstance(each, ast.Starred) for each in node.args):
+    if (
+        isinstance(node, ast.Call)
+        and len(node.args) > 1
+        and not any(isinstance(each, ast.Starred) for each in node.args)
+    ):
         one, other_one, *others = node.args
         if ast.unparse(one) != ast.unparse(other_one):
             yield ast.Call(node.func, [other_one, one, *others], node.keywords)
@@ -198,7 +217,9 @@ def run_mutated(module: str, tree: ast.Module, mutant: Mutant | None, tests: Seq
 def killed_of(module: str, sample: int, seed: int, folder: Path) -> dict[str, Any]:
     """Run a sample of a module's mutants, and print each with its fate."""
     path = ROOT / "atlantis_exp" / f"{module.replace('.', '/')}.py"
-    files = [f"tests/{'/test_'.join(name.rpartition('.')[::2]).lstrip('/')}.py" for name in (module, *ALSO.get(module, ()))]
+    files = [
+        f"tests/{'/test_'.join(name.rpartition('.')[::2]).lstrip('/')}.py" for name in (module, *ALSO.get(module, ()))
+    ]
     watch = observed(path, files, folder)
     tree = ast.parse(path.read_text())
     listed = (Path(__file__).with_name("equivalent_mutants.txt")).read_text().splitlines()
@@ -206,7 +227,10 @@ def killed_of(module: str, sample: int, seed: int, folder: Path) -> dict[str, An
     mutants = [each for each in mutants_of(tree) if f"{module}: {each.change}" not in equivalent]
     chosen = random.Random(seed).sample(mutants, min(sample, len(mutants)))
     by_cost = sorted(watch.seconds, key=watch.seconds.__getitem__)
-    waiting: list[Mutant | None] = [*sorted(chosen, key=lambda each: each.line)[::-1], None]  # first of all the original
+    waiting: list[Mutant | None] = [
+        *sorted(chosen, key=lambda each: each.line)[::-1],
+        None,
+    ]  # first of all the original
     running: dict[int, tuple[Mutant | None, float, Path]] = {}
     survivors: list[str] = []
     while waiting or running:

@@ -14,12 +14,12 @@ from atlantis_exp.learning.learner import Learner
 
 PACKAGE = Path(__file__).resolve().parents[1] / "atlantis_exp"
 WINGS = {"game", "replay", "networks", "learning"}  # which know nothing of each other, nor of any config
-MODULES = {"config", "checking", "components", "faults", "registry", "statistics", "media", "terminal"}
+MODULES = {"config", "checking", "components", "faults", "games", "statistics", "media", "terminal"}
 GROUND = WINGS | MODULES
 MAY: dict[str, Set[str]] = {  # whatever else of the package each may import
-    **dict.fromkeys(("faults", "registry", "statistics", "media", "terminal"), frozenset[str]()),
+    **dict.fromkeys(("faults", "games", "statistics", "media", "terminal"), frozenset[str]()),
     "checking": {"faults"},
-    "components": {"checking", "faults", "registry"},
+    "components": {"checking", "faults", "games"},
     "config": {"checking", "components", "faults"},
     **dict.fromkeys(WINGS, MODULES - {"config", "checking"}),
     "runs": MODULES,

@@ -10,7 +10,8 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
-from atlantis_exp.config import STRICT, PathsConfig, Probability, TrackingConfig
+from atlantis_exp.components import Probability
+from atlantis_exp.config import STRICT, PathsConfig, TrackingConfig
 from atlantis_exp.faults import ConfigError
 
 if TYPE_CHECKING:

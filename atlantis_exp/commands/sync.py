@@ -7,7 +7,8 @@ from pydantic.dataclasses import dataclass
 
 from atlantis_exp.checking import check_server, check_time, seconds
 from atlantis_exp.commands.app import Asked, Verb
-from atlantis_exp.config import STRICT, Count, PathsConfig, TrackingConfig
+from atlantis_exp.components import Count
+from atlantis_exp.config import STRICT, PathsConfig, TrackingConfig
 from atlantis_exp.faults import ConfigError
 
 

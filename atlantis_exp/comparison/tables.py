@@ -26,7 +26,7 @@ from atlantis_exp.comparison.published import Row, Table, curves, scores
 from atlantis_exp.comparison.verdict import Answer, Question, answer, families, group_of
 from atlantis_exp.comparison.words import said
 from atlantis_exp.components import facts_of, title_of
-from atlantis_exp.registry import Game
+from atlantis_exp.games import Game
 from atlantis_exp.statistics import Scores, human_normalised, probability_of_improvement, summarize
 
 Groups = Mapping[str, Sequence[Training]]

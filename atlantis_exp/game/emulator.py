@@ -10,7 +10,7 @@ from ale_py.roms import get_all_rom_ids, get_rom_path
 
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.game.preprocessing import PALETTE, SCREEN_HEIGHT, SCREEN_WIDTH, Pixels, Preprocessing
-from atlantis_exp.registry import Game
+from atlantis_exp.games import Game
 
 ALEInterface.setLoggerMode(LoggerMode.Error)  # of the whole process, and before the first emulator prints its banner
 

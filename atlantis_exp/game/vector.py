@@ -21,7 +21,7 @@ import numpy.typing as npt
 from atlantis_exp.faults import RunFault
 from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.preprocessing import Envs, Pixels
-from atlantis_exp.registry import Game
+from atlantis_exp.games import Game
 
 Rows = npt.NDArray[np.void]  # the last Step of each environment
 Calls = dict[int, tuple[Any, ...]]  # environment to the arguments of a call of its emulator

@@ -1,17 +1,14 @@
 """Which transitions to learn from."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from annotated_types import Interval
 
-from atlantis_exp.components import component
+from atlantis_exp.components import Oversample, Probability
 from atlantis_exp.faults import Fault
 from atlantis_exp.replay.memory import ReplayMemory
-
-Probability = Annotated[float, Interval(ge=0, le=1)]
 
 _MOST_ERROR = 1e30  # so that the sum of all priorities is finite
 _LEAST_ERROR = 1e-6  # added to every error, so that each transition may come again
@@ -53,7 +50,6 @@ class _Stateless:
         pass
 
 
-@component("uniform", "sampler")
 @dataclass(frozen=True)
 class UniformSampler(_Stateless):
     """Every available transition is as likely as any other."""
@@ -63,7 +59,6 @@ class UniformSampler(_Stateless):
         return Draw(memory.draw(batch_size, rng), None)
 
 
-@component("top_half", "sampler")
 @dataclass(frozen=True)
 class TopHalfSampler(_Stateless):
     """Of `oversample` times the batch drawn uniformly, the transitions of highest reward, best first.
@@ -72,7 +67,7 @@ class TopHalfSampler(_Stateless):
     then take only the top half". Of equal rewards the one drawn earlier comes first.
     """
 
-    oversample: Annotated[int, Interval(ge=2, le=64)]
+    oversample: Oversample
 
     def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> Draw:
         """Draw `batch_size` transitions, chosen by the game's rewards alone; ValueError if there are none."""
@@ -80,7 +75,6 @@ class TopHalfSampler(_Stateless):
         return Draw(ids[np.argsort(-memory.rewards(ids), kind="stable")[:batch_size]], None)
 
 
-@component("prioritized", "sampler")
 class PrioritizedSampler:
     """A transition is as likely as its last error to the power `alpha` (Schaul et al. 2016, proportional).
 

@@ -10,7 +10,6 @@ from typing import Any, Literal, Self, TypeVar
 from atlantis_exp.checking import nearest, parse
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
-from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.runs import lock
 from atlantis_exp.runs.files import SMALL, Natural, inside, read_file, schema_of, write_file
 from atlantis_exp.runs.journal import Commit, Record, Status, has_lost_commit, read, read_commit
@@ -27,6 +26,8 @@ BEST_EPISODE = "best_episode.mp4"
 NETWORK = "network"  # the models that are a training's networks
 EVALUATION, EVALUATION_REPORT = "evaluation/episodes.csv", "evaluation/report.txt"  # of a run that is one evaluation
 
+TABLE_COLUMNS = ("mean", "standard_error", "median", "interquartile_mean", "high", "low")
+"""The parts of a summary of scores that a row of a table shows, in order."""
 EVALUATED = {*(f"evaluation/{point}" for point in (*TABLE_COLUMNS, "episodes", "epsilon")), "actions/random_share"}
 """The metrics of an evaluation that tables show."""
 LOST = "lost"  # the tag of a run that lost a part of its replay memory: not the unbroken one bit for bit

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.game.vector import Emulators
-from atlantis_exp.registry import Game
+from atlantis_exp.games import Game
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.statistics import Summary, summarize
 from atlantis_exp.training.actor import Actor, Decisions

@@ -15,10 +15,9 @@ from pydantic import Field
 from atlantis_exp.faults import Fault
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.media import score_heatmap, score_histogram
-from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.runs.files import schema_of
-from atlantis_exp.runs.folder import BEST_EPISODE, EPISODES, EVALUATED, NETWORK, evaluation_at
+from atlantis_exp.runs.folder import BEST_EPISODE, EPISODES, EVALUATED, NETWORK, TABLE_COLUMNS, evaluation_at
 from atlantis_exp.runs.journal import Tracker
 from atlantis_exp.training.checkpoint import to_safetensors
 from atlantis_exp.training.evaluation import Evaluation, Stopped

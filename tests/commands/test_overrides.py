@@ -216,8 +216,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("export too=pretrained/fast", "too=pretrained/fast", "'to'"),
     ("report paths.output=x", "paths.output", "'paths.outputs'"),
     ("new component.model=cnn to=x", "model=cnn", "built in"),
-    ("new component.model=MyNet to=x", "model=MyNet", "small letters"),
-    ("new component.model=none to=x", "model=none", "Python's own"),
+    ("new component.model=MyNet to=x", "model=MyNet", "lowercase letters"),
     ("new component.model=class to=x", "model=class", "Python's own"),
     ("ui port=80", "port=80", "greater than or equal to 1024"),
 ]

@@ -292,7 +292,7 @@ def test_workers_import_nothing_but_this_wing_what_a_fault_is_and_what_pays_poin
     code = "import sys, atlantis_exp.game.atlantis, atlantis_exp.game.vector; print(*sys.modules)"
     modules = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True).stdout.split()
     ours = {name for name in modules if name.startswith("atlantis_exp.")}
-    assert ours == {"atlantis_exp.game", "atlantis_exp.faults", "atlantis_exp.registry"} | {
+    assert ours == {"atlantis_exp.game", "atlantis_exp.faults", "atlantis_exp.games"} | {
         f"atlantis_exp.game.{room}" for room in ("atlantis", "preprocessing", "emulator", "vector")
     }
     assert not {"torch", "mlflow", "hydra", "omegaconf", "matplotlib"} & set(modules)
