@@ -205,7 +205,7 @@ def evaluate(
     Raises:
         Stopped: when `stop`, which is asked before every step is received, says so.
     """
-    game = emulators.game
+    game, emulators.stop = emulators.game, stop
     played = [
         Episode(_seed_sequence(seed, index).generate_state(1).item(), points=[0.0] * len(game.sources))
         for index in range(episodes)
