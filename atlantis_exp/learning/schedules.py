@@ -9,7 +9,7 @@ from annotated_types import Interval
 from atlantis_exp.components import component
 
 Probability = Annotated[float, Interval(ge=0, le=1)]
-Positive = Annotated[float, Interval(gt=0)]
+Positive = Annotated[float, Interval(gt=0, le=1_000)]
 Share = Annotated[float, Interval(gt=0, lt=1)]
 Count = Annotated[int, Interval(ge=1, le=1_000_000_000_000)]
 
