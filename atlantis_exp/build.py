@@ -344,6 +344,7 @@ def build_evaluator(env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig) -> Eva
         num_envs=evaluation.at_once,
         size=env.size,
         stack=env.stack,
+        most_frames=env.max_frames,
         video="first_minute" if evaluation.video is True else evaluation.video or None,
     )
 

@@ -38,7 +38,7 @@ NAME: Final = r"^[a-z][a-z0-9_]{0,39}$"
 
 # Ranges of settings.
 Count = Annotated[int, Interval(ge=1, le=10**12)]
-Positive = Annotated[float, Interval(gt=0)]
+Positive = Annotated[float, Interval(gt=0, le=1_000)]
 Probability = Annotated[float, Interval(ge=0, le=1)]
 Share = Annotated[float, Interval(gt=0, lt=1)]
 # Types of our own settings whose classes need torch or numpy.

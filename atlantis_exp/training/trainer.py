@@ -61,10 +61,11 @@ class Trainer:
 
         Raises:
             Diverged: when the loss is no finite number; nothing is committed then.
-            WorkerDied: when an emulator's process has ended.
+            WorkerDied: when an emulator's process has ended or hangs; the last commit stays.
             OSError: when a commit cannot be written; the last one stays.
         """
         overlap = self.emulators.num_envs > 1  # learn while they play
+        self.emulators.stop = stop
         self._begin(stop)
         while not self.has_ended and not stop():
             sampler = self.plan.phase_at(self.counters).sampler

@@ -68,7 +68,7 @@ def folder(tiny: Compose, tmp_path: Path) -> Path:
         (
             "scores",
             [0] * 1_000_001,
-            "card.json: scores=[0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0...: should",
+            "...: should have at most 1000000 items",
         ),
     ],
 )
