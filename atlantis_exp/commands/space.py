@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from hydra.core.override_parser.types import Glob, IntervalSweep, RangeSweep
-from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
 from atlantis_exp.commands.app import Asked
 from atlantis_exp.commands.jobs import job_of
@@ -17,7 +17,8 @@ _CORNERS = 32  # configs that are composed before a search starts, at 0.1 s each
 _MOST_NUMBERS = 100_000  # of a range with fractions
 
 
-Space = Mapping[str, BaseDistribution]
+Distribution = CategoricalDistribution | FloatDistribution | IntDistribution
+Space = Mapping[str, Distribution]
 """The distribution of each key; a choice's values are texts, as an override has them."""
 
 
@@ -32,7 +33,7 @@ def read_space(texts: Mapping[str, str], closed: set[str]) -> Space:
     return {key: _read(key, text, closed) for key, text in texts.items()}
 
 
-def _read(key: str, text: str, closed: set[str]) -> BaseDistribution:
+def _read(key: str, text: str, closed: set[str]) -> Distribution:
     override = read_override(f"{key}={text}")
     if override.key_or_group != key:  # as `++seed` or `sampler@samplers.uniform`, which MLflow takes no name from
         raise ConfigError(

@@ -4,7 +4,6 @@ The runs are ordinary ones, and the looks are those of `compare` over them, whos
 moment, the same command goes on where it was.
 """
 
-import re
 import subprocess
 import sys
 import tempfile
@@ -30,7 +29,7 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import Journal, Metrics, NullJournal
+from atlantis_exp.runs.journal import Journal, NullJournal
 from atlantis_exp.sessions.job import Job, command_line, labels, quoted, replaced
 from atlantis_exp.sessions.page import opened, terminable
 from atlantis_exp.sessions.sweep import ledger
@@ -68,8 +67,8 @@ class Contest:
         job_of: Callable[[tuple[str, ...]], Job],
         command: str,
     ) -> None:
-        self.several, self.command = several, command
-        self._fixed, self._launcher, self._job_of = fixed, launcher, job_of
+        self.several, self.launcher, self.command = several, launcher, command
+        self._fixed, self._job_of = fixed, job_of
         jobs = {each: job_of((*replaced(fixed, *each),)) for each in chosen}
         facts = {each: flatten(to_dict(job.config)) for each, job in jobs.items()}
         for key in question.by:
@@ -205,50 +204,30 @@ class Contest:
         """Return those of some seeds with which a contender has not been trained to its end."""
         return [seed for seed in seeds if not self._has_ended(self.run(label, seed))]
 
-    def train(self, needed: Mapping[str, Sequence[int]]) -> None:
-        """Train seeds of contenders, all contenders' first seed before their second ones. Raises: Fault."""
-        try:
-            if not self._launcher:
-                order = sorted((seed, at, label) for at, (label, seeds) in enumerate(needed.items()) for seed in seeds)
-                jobs = [self.job(label, seed) for seed, _, label in order]
-                with ledger(jobs, self.several, command=self.command):
-                    for job in jobs:
-                        if (late := train(job)) is not None:
-                            sys.exit(128 + late)
-            elif (
-                self.several and len(set(map(tuple, needed.values()))) == 1 and needed.keys() == self.contenders.keys()
-            ):
-                self._launch(next(iter(needed.values())), self.several)
-            else:
-                for label, seeds in needed.items():
-                    self._launch(seeds, self.contenders[label][0])
-            for label, seeds in needed.items():
-                for seed in self.left(label, seeds):
-                    raise Fault(f"run {self.run(label, seed).name} has not ended")
-        except Fault as fault:
-            raise Fault(f"{fault}; the decision goes on with: {self.command}", fault.exit_code) from fault
+    def jobs(self, needed: Mapping[str, Sequence[int]]) -> list[Job]:
+        """Return the trainings of seeds of contenders, all contenders' first seed before their second ones."""
+        order = sorted((seed, at, label) for at, (label, seeds) in enumerate(needed.items()) for seed in seeds)
+        return [self.job(label, seed) for seed, _, label in order]
 
-    def _launch(self, seeds: Sequence[int], chosen: Sequence[str]) -> None:
-        """Run a sweep by the launcher that was asked for. Raises: Fault."""
-        overrides = [f"seed={','.join(map(str, seeds))}", *replaced(self._fixed, *chosen)]
-        command = [sys.executable, "-m", "atlantis_exp", "train", "-m", *self._launcher, *overrides]
-        with subprocess.Popen(command) as sweep:
-            try:
-                code = sweep.wait()
-            except BaseException:
-                sweep.terminate()  # it has its jobs commit, and is waited for
-                raise
-        if code:
-            raise Fault(f"a sweep ended with exit code {code}", exit_code=code if code > 0 else 128 - code)
+    def sweeps(self, needed: Mapping[str, Sequence[int]]) -> list[list[str]]:
+        """Return the command lines of the sweeps in which a launcher trains them: one, if all need the same seeds."""
+        parts = [(seeds, self.contenders[label][0]) for label, seeds in needed.items()]
+        if self.several and needed.keys() == self.contenders.keys() and len({tuple(seeds) for seeds, _ in parts}) == 1:
+            parts = [(parts[0][0], tuple(self.several))]
+        return [
+            ["train", "-m", *self.launcher, f"seed={','.join(map(str, seeds))}", *replaced(self._fixed, *overrides)]
+            for seeds, overrides in parts
+        ]
 
 
-def decide(contest: Contest) -> None:
+def decide(contest: Contest, train: Callable[[Job], int | None] = train) -> None:
     """Train the contenders' seeds in the order of the plan, look, drop what is decided, and say the answer.
 
     Raises:
         Fault: a training fails; the same command goes on.
     """
     tracking = contest.config.tracking
+    again = f"the decision goes on with: {contest.command}"
     catch_up(contest.outputs, tracking.uri)
     shown = labels(
         f"decide {' '.join(contest.several) or ' against '.join(contest.contenders)}", run_colour("decide"), "decision"
@@ -262,11 +241,36 @@ def decide(contest: Contest) -> None:
                     _write(journal, contest, comparison)
                 if not (needed := contest.needed(comparison)):
                     break
-                contest.train(needed)
+                try:
+                    _train(contest, needed, train)
+                except Fault as fault:
+                    raise Fault(f"{fault}; {again}", fault.exit_code) from fault
     except (SystemExit, KeyboardInterrupt) as ended:
-        terminal.warn(f"the decision goes on with: {contest.command}")
+        terminal.warn(again)
         sys.exit(ended.code if isinstance(ended, SystemExit) else 130)
     print(f"its runs again: {contest.comparing}")
+
+
+def _train(contest: Contest, needed: Mapping[str, Sequence[int]], train: Callable[[Job], int | None]) -> None:
+    if contest.launcher:
+        for arguments in contest.sweeps(needed):
+            with subprocess.Popen([sys.executable, "-m", "atlantis_exp", *arguments]) as sweep:
+                try:
+                    code = sweep.wait()
+                except BaseException:
+                    sweep.terminate()  # it has its jobs commit, and is waited for
+                    raise
+            if code:
+                raise Fault(f"a sweep ended with exit code {code}", exit_code=code if code > 0 else 128 - code)
+    else:
+        jobs = contest.jobs(needed)
+        with ledger(jobs, contest.several, command=contest.command):
+            for job in jobs:
+                if (late := train(job)) is not None:
+                    sys.exit(128 + late)
+    for label, seeds in needed.items():
+        for seed in contest.left(label, seeds):
+            raise Fault(f"run {contest.run(label, seed).name} has not ended")
 
 
 def say_what_it_takes(contest: Contest) -> None:
@@ -332,40 +336,16 @@ def _spread(contest: Contest) -> tuple[float, str] | None:
 
 
 def _write(journal: Journal, contest: Contest, comparison: Comparison) -> None:
-    """Write to the page the looks that it does not have yet, what they spent, and what is known now."""
-    there = {
-        (record.step, key)
-        for record in contest.folder.records()
-        if isinstance(record, Metrics)
-        for key in record.values
-    }
-    rows = []
-    for answer in comparison.answers:
-        spent = 0.0
-        for look in answer.decision.looks:
-            spent += look.error
-            values = {f"error_spent/{answer.family.name}": spent}
-            for verdict in look.verdicts:
-                pair = f"{verdict.group} over {verdict.other}"
-                for name in ("difference", "low", "high"):
-                    values[f"{name}/{answer.family.name}/{pair}"] = getattr(verdict, name)
-                rows.append(
-                    f"| {look.size} | {pair} | {verdict.said} | {verdict.difference:,.0f} "
-                    f"| {verdict.low:,.0f} to {verdict.high:,.0f} | {look.error:.2%} |"
-                )
-            named = {_metric(name): value for name, value in values.items()}
-            if new := {key: value for key, value in named.items() if (look.size, key) not in there}:
-                journal.metrics(new, look.size)
+    """Write to the page the looks that were taken and what is known now."""
+    table = ["| look at seeds | pair | said | difference | interval | error spent |", f"|{' --- |' * 6}"] + [
+        f"| {look.size} | {verdict.group} over {verdict.other} | {verdict.said} | {verdict.difference:,.0f} "
+        f"| {verdict.low:,.0f} to {verdict.high:,.0f} | {look.error:.2%} |"
+        for answer in comparison.answers
+        for look in answer.decision.looks
+        for verdict in look.verdicts
+    ]
+    commands = [f"Continue or report: `{contest.command}`", f"Its runs again: `{contest.comparing}`"]
     journal.tags({"verdict": comparison.verdict})
-    head = ["| look at seeds | pair | said | difference | interval | error spent |", f"|{' --- |' * 6}"]
-    commands = f"Continue or report: `{contest.command}`\n\nIts runs again: `{contest.comparing}`"
-    table = "\n".join([*head, *rows]) if rows else ""
-    lines = [comparison.verdict, *comparison.others, *comparison.caveats, table, commands]
-    journal.note("\n\n".join(line for line in lines if line))
+    said = [comparison.verdict, *comparison.others, *comparison.caveats]
+    journal.note("\n\n".join([*said, "\n".join(table), *commands]))
     journal.flush()
-
-
-def _metric(name: str) -> str:
-    """Return a name in MLflow's alphabet: what is measured, of which family, of which pair."""
-    whole = "/".join(re.sub(r"[^A-Za-z0-9_. -]|^\W", "_", part) for part in name.split("/", 2))
-    return whole if len(whole) <= 250 else f"{whole[:240]} {digest({'name': name})[:8]}"

@@ -10,8 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
-import numpy as np
-
 from atlantis_exp import terminal
 from atlantis_exp.checking import digest
 from atlantis_exp.faults import Fault
@@ -81,7 +79,6 @@ def _page(runs: Runs, swept: Sequence[str], launcher: Launcher, command: str) ->
     outputs = Path(config.paths.outputs)
     sweep = RunFolder(outputs / "sweeps" / f"sweep-{digest({'runs': sorted(folder.name for folder in runs)})}")
     labels = {"mlflow.runName": f"sweep {' '.join(swept)}", "atlantis.kind": "training sweep"}
-    was_complete = sweep.status == "FINISHED"
 
     def adopt_all() -> None:
         for folder, job in runs.items():
@@ -109,7 +106,7 @@ def _page(runs: Runs, swept: Sequence[str], launcher: Launcher, command: str) ->
             with _every(_PAGE_SECONDS, describe) as close_page, _launched(launcher, journal, runs, close_page):
                 yield
         finally:
-            _draw(journal, runs, was_complete)
+            _draw(journal, runs)
             describe()
 
 
@@ -181,51 +178,33 @@ def _describe(journal: Journal, runs: Runs) -> None:
         if folder.state == "failed":
             told = f" (`{TRACEBACK}` of the run tells all)" if (folder.path / TRACEBACK).exists() else ""
             failures.append(f"- **{job.title} failed**: {folder.error}{told}")
-    groups = [
-        f"| {name} | {len(means)} | {np.mean(means):,.0f} | {min(means):,.0f} | {max(means):,.0f} |"
-        for name, (_, means) in _evaluations(runs).items()
-    ]
-    summary = ["| group | runs | mean of the means | lowest | highest |\n| --- | ---: | ---: | ---: | ---: |", *groups]
-    parts = [
-        fitted(summary, NOTE_LENGTH // 4, "`runs.csv`") if groups else "",
-        fitted(failures, NOTE_LENGTH // 4, "`runs.csv`"),
-        "Figures: `curves.png`, `scores.png`.",
-    ]
+    parts = [fitted(failures, NOTE_LENGTH // 4, "`runs.csv`"), "Figures: `curves.png`, `scores.png`."]
     above = "\n\n".join(part for part in parts if part)
     journal.note(f"{above}\n\n{fitted(lines, NOTE_LENGTH - len(above), '`runs.csv`')}")
     journal.flush()
 
 
-def _draw(journal: Journal, runs: Runs, was_complete: bool) -> None:
-    """Write the sweep's figures and its table of numbers; the figures also as pictures once all runs have ended."""
+def _draw(journal: Journal, runs: Runs) -> None:
+    """Write the sweep's figures and its table of numbers."""
     trained: dict[str, tuple[str, list[list[tuple[float, float]]]]] = {}
+    evaluated: dict[str, tuple[str, list[float]]] = {}
     rows: list[dict[str, Any]] = []
     for folder, job in runs.items():
         trained.setdefault(job.group, (job.colour, []))[1].append(_curve(folder, "score/mean_100"))
-        result = folder.result
-        numbers = {"steps": result.steps, **result.counts, **result.evaluation} if result else {}
+        numbers: dict[str, float] = {}
+        if (result := folder.result) is not None:
+            numbers = {"steps": result.steps, **result.counts, **result.evaluation}
+            if result.evaluation:
+                evaluated.setdefault(job.group, (job.colour, []))[1].append(result.evaluation["evaluation/mean"])
         rows.append({"run": folder.name, "title": job.title, "state": folder.state, **numbers})
-    figures = {"curves": curves(trained, "step", "score, mean of 100 episodes")}
-    if evaluated := _evaluations(runs):
-        figures["scores"] = strips(evaluated, "mean score of the last evaluation, a dot a run")
-    for name, picture in figures.items():
-        journal.artifact(f"{name}.png", picture)
-        if not was_complete and all(row["state"] == "done" for row in rows):
-            journal.image(f"sweep/{name}", picture, 0)
+    journal.artifact("curves.png", curves(trained, "step", "score, mean of 100 episodes"))
+    if evaluated:
+        journal.artifact("scores.png", strips(evaluated, "mean score of the last evaluation, a dot a run"))
     text = io.StringIO()
     writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     journal.artifact("runs.csv", text.getvalue().encode())
-
-
-def _evaluations(runs: Runs) -> dict[str, tuple[str, list[float]]]:
-    """Return the colour of each group and the evaluated means of its runs."""
-    groups: dict[str, tuple[str, list[float]]] = {}
-    for folder, job in runs.items():
-        if (result := folder.result) is not None and result.evaluation:
-            groups.setdefault(job.group, (job.colour, []))[1].append(result.evaluation["evaluation/mean"])
-    return groups
 
 
 def _curve(folder: RunFolder, key: str) -> list[tuple[float, float]]:

@@ -22,9 +22,8 @@ from atlantis_exp.commands.overrides import check, swept
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import _name as _metric_name
 from atlantis_exp.runs.journal import read_commit
-from atlantis_exp.sessions.deciding import Contest, _metric, decide, say_what_it_takes
+from atlantis_exp.sessions.deciding import Contest, decide, say_what_it_takes
 from atlantis_exp.sessions.job import replaced
 from atlantis_exp.tracking.publishing import catch_up
 
@@ -140,30 +139,20 @@ def test_decided_pairs_are_dropped_and_the_page_in_mlflow_has_each_look_once(
     experiment = client.get_experiment_by_name("atlantis")
     assert experiment is not None
 
-    def page() -> dict[str, list[tuple[int, float]]]:
-        catch_up(tmp_path)  # a busy machine may not have sent all of it in time
-        (run,) = client.search_runs([experiment.experiment_id], "tags.`atlantis.kind` = 'decision'")
-        assert run.info.status == "FINISHED"
-        assert run.data.tags["verdict"].startswith("lr=0.001 plays better than lr=0.002")
-        assert "| 5 | lr=0.001 over lr=0.002 | better |" in run.data.tags["mlflow.note.content"]
-        assert contest.comparing in run.data.tags["mlflow.note.content"]
-        return {
-            key: [(point.step, point.value) for point in client.get_metric_history(run.info.run_id, key)]
-            for key in run.data.metrics
-        }
-
-    first = page()
-    assert [step for step, _ in first["error_spent/optimizer.lr"]] == [5, 10]
-    assert [spent for _, spent in first["error_spent/optimizer.lr"]] == pytest.approx([0.0125, 0.05])
-    assert [step for step, _ in first["difference/optimizer.lr/lr_0.001 over lr_0.002"]] == [5]
-    pair = "optimizer.lr/lr_0.002 over lr_0.003"
-    assert [step for step, _ in first[f"difference/{pair}"]] == [5, 10]
-    for (_, low), (_, difference), (_, high) in zip(
-        *(first[f"{name}/{pair}"] for name in ("low", "difference", "high")), strict=True
+    catch_up(tmp_path)  # a busy machine may not have sent all of it in time
+    (run,) = client.search_runs([experiment.experiment_id], "tags.`atlantis.kind` = 'decision'")
+    assert run.info.status == "FINISHED"
+    assert run.data.tags["verdict"].startswith("lr=0.001 plays better than lr=0.002")
+    note = run.data.tags["mlflow.note.content"]
+    for look in (
+        *("5 | lr=0.001 over lr=0.002 | better", "5 | lr=0.001 over lr=0.003 | better"),
+        *("5 | lr=0.002 over lr=0.003 | not decided", "10 | lr=0.002 over lr=0.003 | not decided"),
     ):
-        assert low < difference < high
+        assert note.count(f"| {look} |") == 1
+    assert contest.comparing in note
     decide(contest)
-    assert page() == first
+    catch_up(tmp_path)
+    assert client.get_run(run.info.run_id).data.tags["mlflow.note.content"] == note
 
 
 @pytest.mark.slow
@@ -178,12 +167,6 @@ def test_seeds_that_are_there_are_looked_at_without_a_training(
     assert [len(look["seeds"]) for look in looks(tmp_path)["optimizer.lr"]] == [3, 2]  # type: ignore[arg-type]
     assert "would have been found with 80 %" in " ".join(capsys.readouterr().out.split())
     assert set((tmp_path / "runs").iterdir()) == before
-
-
-def test_metrics_have_names_that_mlflow_takes_whatever_the_contenders_are_called() -> None:
-    for value in ("../w", "/home/x/weights", "größe", "cnn top_half", "a" * 300):
-        _metric_name(name := _metric(f"difference/training.weights/{value} over none"))
-        assert name.startswith("difference/training.weights/")
 
 
 @pytest.mark.slow
