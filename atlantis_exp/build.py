@@ -17,17 +17,17 @@ from torch import nn
 
 from atlantis_exp import config as cfg
 from atlantis_exp.checking import to_dict
-from atlantis_exp.components import Component, Method, admitted, describe, facts_of
+from atlantis_exp.components import Component, admitted, describe, facts_of, points_of
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.game.emulator import Emulator, check_game
 from atlantis_exp.game.preprocessing import FrameStack, Preprocessing
 from atlantis_exp.game.vector import Emulators, make_emulators
+from atlantis_exp.games import Game
 from atlantis_exp.learning.allocation import keep_freed_memory
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.learning.values import ActionValues
 from atlantis_exp.networks.dropout import seed_dropout
 from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
-from atlantis_exp.registry import Game
 from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.runs.folder import CHECKPOINTS
 from atlantis_exp.runs.journal import Tracker
@@ -58,11 +58,7 @@ def build_game(component: Component) -> Game:
     game = facts_of(component)
     if component.plugin is not None:
         check_game(game)
-    if not game.sources:
-        return game
-    # What a plugin's file defines, a worker process cannot import.
-    points = component.load().points if component.plugin is None else Method(component, "points")
-    return dataclasses.replace(game, points=points)
+    return dataclasses.replace(game, points=points_of(component)) if game.sources else game
 
 
 def make_emulator(env: cfg.EnvConfig) -> partial[Emulator]:
@@ -167,7 +163,9 @@ def _check_output(config: cfg.Config, network: nn.Module) -> None:
     with component.blamed(), torch.no_grad():
         made = tuple(network.eval()(torch.zeros(2, env.stack, env.size, env.size)).shape)
         if made != shape:
-            raise TypeError(f"{component.class_name} returns {made} for two states; it should be {shape}, the head's")
+            raise TypeError(
+                f"{component.load().__name__} returns {made} for two states; it should be {shape}, the head's"
+            )
 
 
 def _num_actions(config: cfg.Config) -> int:
@@ -307,6 +305,8 @@ def build_trained_network(config: cfg.Config, weights: bytes) -> nn.Module:
             _architecture(config).load_state_dict(tensors, assign=True)
         network = build_network(config, "network")
         network.load_state_dict(tensors)
+        if not all(tensor.isfinite().all() for tensor in tensors.values()):
+            raise Fault("the weights are not all finite numbers: their training diverged, or they are damaged")
     except Fault:  # of a plugin
         raise
     except (SafetensorError, RuntimeError) as error:
@@ -344,6 +344,7 @@ def build_evaluator(env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig) -> Eva
         num_envs=evaluation.at_once,
         size=env.size,
         stack=env.stack,
+        most_frames=env.max_frames,
         video="first_minute" if evaluation.video is True else evaluation.video or None,
     )
 

@@ -1,6 +1,6 @@
 """How often a verdict is wrong for whoever follows it to the end: `python -m benchmarks.decisions`.
 
-Groups of ten seeds are drawn whose true means are known, and users compare them through `atlantis_exp.decision`: one
+Groups of ten seeds are drawn whose true means are known, and users compare them through `comparison.decision`: one
 who trains up to the next look that is printed, one who asks after every seed, and one who asks after every seed and has
 a look taken each time. All of them continue until nothing is open. The plan promises nothing to a fourth, who watches
 the scores and asks once they are far enough apart. A decision is false where it says better or worse
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.special import stdtrit
 from scipy.stats import norm
 
-from atlantis_exp.decision import Decision, Look, Plan, decide, looks_up_to, mean_interval
+from atlantis_exp.comparison.decision import Decision, Look, Plan, decide, looks_up_to, mean_interval
 from benchmarks.contest import print_results, print_table
 
 Values = npt.NDArray[np.float64]

@@ -22,7 +22,8 @@ import numpy as np
 
 from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.runs.journal import Journal, NullJournal, Tracker
-from atlantis_exp.tracking.store import Publisher, Store
+from atlantis_exp.tracking.publishing import Publisher
+from atlantis_exp.tracking.store import Store
 from atlantis_exp.training.evaluation import Episode, Evaluation
 from atlantis_exp.training.trainer import Trainer
 from benchmarks.composition import composed

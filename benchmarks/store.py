@@ -21,12 +21,12 @@ from atlantis_exp.commands.overrides import check
 from atlantis_exp.commands.report import VERB as REPORT
 from atlantis_exp.commands.sync import VERB as SYNC
 from atlantis_exp.components import facts_of
-from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import Result, RunFolder, evaluation_at
 from atlantis_exp.runs.journal import Commit, commit_bytes, read_commit
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.sweep import ledger
-from atlantis_exp.tracking.store import Cursor, Store, files_digest, small_files
+from atlantis_exp.tracking.mirror import PRIMARY, Cursor, digest
+from atlantis_exp.tracking.store import Store
 from atlantis_exp.training.evaluation import Episode, Evaluation
 from benchmarks.composition import composed
 
@@ -119,9 +119,7 @@ def publish_nothing(outputs: Path) -> None:
     for path in outputs.glob("runs/*/commit.json"):
         folder = path.parent
         if (commit := read_commit(folder)) is not None:
-            digest = files_digest(small_files(folder, commit, is_server=False))
-            note = Cursor(address, commit.identity, "0" * 32, commit.offset, digest)
-            write_file(folder / "published.json", json.dumps(dataclasses.asdict(note)).encode())
+            Cursor(address, commit.identity, "0" * 32, commit.offset, digest(commit)).save(folder / PRIMARY)
 
 
 def measure(command: Callable[[], object]) -> tuple[float, float]:

@@ -60,6 +60,7 @@ FACTS = r"vessel|bomber|\bguns?\b|building|\bcity\b|wave|leftfire|rightfire|12[_
 NAMES = (  # of the package, of its tags in MLflow, of its presets, which are no facts of the game
     *(r"atlantis[_-]exp", r"[\"'`(]atlantis\.(\w+|$)?", r"atlantis_standard", r"atlantis[_-]\{", r"\batlantis\.py"),
     r'experiment: str = "atlantis"',
+    r'_ours\("env".*',
 )
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from atlantis_exp.comparison.decision import mean_interval
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.components import game_of
 from atlantis_exp.config import Config
-from atlantis_exp.decision import mean_interval
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.folder import RunFolder, all_runs, evaluation_at
 from atlantis_exp.runs.journal import Metrics, Tags

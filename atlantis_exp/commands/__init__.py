@@ -22,7 +22,7 @@ VERBS = {
     "new": "a package with a component of your own, to begin with: model=mynet to=FOLDER",
     "verify-resume": "proves, for any training, that killing and continuing it changes no bit",
     "report": "the results that the outputs folder holds, as a table",
-    "sync": "run folders into an MLflow store; to=URI to a server, from=URI from one, every=30s until interrupted",
+    "sync": "run folders into an MLflow store; to=URI to a server, every=30s until interrupted",
     "ui": "the MLflow UI on the local store",
 }
 """Each verb and what it does, as `--help` lists them."""

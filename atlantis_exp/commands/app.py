@@ -16,7 +16,7 @@ from atlantis_exp import terminal
 from atlantis_exp.commands import CONF
 from atlantis_exp.commands.composing import admit, checked
 from atlantis_exp.commands.overrides import check, is_run, launcher, located, refuse_twice
-from atlantis_exp.faults import Fault
+from atlantis_exp.faults import Fault, remedied
 from atlantis_exp.sessions.job import command_line
 from atlantis_exp.sessions.launchers import Launcher, job_apart
 
@@ -106,7 +106,7 @@ class Verb(Generic[T]):
 
 def exit_with(error: Exception) -> NoReturn:
     """End the process with one line and the error's exit code: 2 for a user's mistake."""
-    terminal.warn(str(error))
+    terminal.warn(remedied(error))
     sys.exit(getattr(error, "exit_code", 1))
 
 

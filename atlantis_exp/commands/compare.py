@@ -10,7 +10,8 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
-from atlantis_exp.config import STRICT, PathsConfig, Probability, TrackingConfig
+from atlantis_exp.components import Probability
+from atlantis_exp.config import STRICT, PathsConfig, TrackingConfig
 from atlantis_exp.faults import ConfigError
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ class CompareConfig:
     baseline: str | None  # a value of one of the keys of by, or a group; null: all pairs
     delta: str | float | None  # a difference that does not matter: 5% of a score, or points
     seeds: Annotated[int, Field(ge=5, le=10_000)]  # a group, at the last look
-    error: Annotated[float, Field(gt=0, lt=1)]  # probability of any false verdict
+    error: Annotated[float, Field(ge=1e-6, lt=1)]  # probability of any false verdict
     look: Literal["due", "now"]
     why: bool  # also ask the networks themselves
     tracking: TrackingConfig

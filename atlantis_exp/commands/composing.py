@@ -98,7 +98,7 @@ def admit(plugins: Any) -> None:
     for component in components.admitted().values():
         if (CONF / component.kind / f"{component.name}.yaml").is_file():
             raise ConfigError(
-                f"{component.source.path}:{component.line}: {component.kind}={component.name} is one of our presets "
+                f"{component.path}:{component.line}: {component.kind}={component.name} is one of our presets "
                 "and is not replaced; give yours another name"
             )
         ConfigStore.instance().store(name=component.name, group=component.kind, node=_option(component))
@@ -112,7 +112,7 @@ def _option(component: components.Component) -> dict[str, Any]:
     if component.kind == "model":
         node["input_size"] = component.facts["input_size"]
     node |= {each.name: "???" if each.default is MISSING else each.default for each in component.settings}
-    path = component.source.path.parent / "conf" / component.kind / f"{component.name}.yaml"
+    path = component.path.parent / "conf" / component.kind / f"{component.name}.yaml"
     if path.is_file():
         try:
             values = OmegaConf.to_container(OmegaConf.load(path))

@@ -39,7 +39,7 @@ class DecideConfig(Config):
     baseline: str | None
     delta: str | Annotated[float, Field(gt=0)] | Annotated[int, Field(gt=0)] | None
     seeds: Annotated[int, Field(ge=5, le=1_000)]
-    error: Annotated[float, Field(gt=0, lt=1)]
+    error: Annotated[float, Field(ge=1e-6, lt=1)]
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -370,11 +370,8 @@ def _located(match: re.Match[str]) -> str:
 
 def _offered(folder: str, name: str) -> str:
     """What to write for an option that an installed distribution offers; empty where none does."""
-    offers = [each for parts in installed().values() for each in parts if (each.kind, each.name) == (folder, name)]
-    if not offers or not offers[0].plugin:
-        return ""
-    plugins = ", ".join(f"plugins={each.plugin.name} ({each.plugin})" for each in offers if each.plugin)
-    return f"{folder}={name}: add {plugins}"
+    offers = [f"plugins={plugin}" for plugin, names in installed().items() if folder in KINDS and name in names]
+    return f"{folder}={name}: add {' or '.join(offers)}" if offers else ""
 
 
 @cache

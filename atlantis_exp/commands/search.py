@@ -11,7 +11,8 @@ from pydantic.dataclasses import dataclass
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.jobs import training_of
 from atlantis_exp.commands.overrides import refuse_twice, swept
-from atlantis_exp.config import FREE, STRICT, Config, Count
+from atlantis_exp.components import Count
+from atlantis_exp.config import FREE, STRICT, Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.sessions.job import command_line, replaced
 

@@ -17,7 +17,7 @@ from atlantis_exp.checking import flatten, nearest, parse, to_dict
 from atlantis_exp.components import Component, facts_of, game_of, title_of
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
-from atlantis_exp.registry import Game
+from atlantis_exp.games import Game
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.facts import read_tags
 from atlantis_exp.runs.folder import BEST_EPISODE, EVALUATION, RESULT, RunFolder, evaluation_at

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
+from atlantis_exp.comparison.decision import FEWEST_SEEDS, Look
 from atlantis_exp.comparison.verdict import Answer, Family
-from atlantis_exp.decision import FEWEST_SEEDS, Look
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import SMALL, read_file, write_file
 from atlantis_exp.runs.folder import CONFIG, LOOKS

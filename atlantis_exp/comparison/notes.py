@@ -8,11 +8,11 @@ from math import isclose, nan
 from statistics import fmean
 from typing import TypeVar
 
+from atlantis_exp.comparison.decision import FEWEST_SEEDS, equal_scores
 from atlantis_exp.comparison.gather import AXES, COMMIT, Training, resolve
 from atlantis_exp.comparison.published import Table, early_dqn, random_line
 from atlantis_exp.comparison.verdict import Answer
 from atlantis_exp.components import Component, facts_of
-from atlantis_exp.decision import FEWEST_SEEDS, equal_scores
 from atlantis_exp.runs.folder import LOST
 from atlantis_exp.terminal import PROGRAM
 

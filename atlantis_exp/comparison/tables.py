@@ -10,14 +10,23 @@ from math import isnan
 
 import numpy as np
 
+from atlantis_exp.comparison.decision import (
+    FEWEST_SEEDS,
+    Look,
+    Plan,
+    Verdict,
+    decide,
+    equal_scores,
+    mean_interval,
+    modes,
+)
 from atlantis_exp.comparison.gather import AXES, Array, Gathered, Player, Training, plays_alike
 from atlantis_exp.comparison.notes import CAVEATS, NOTES, Facts
 from atlantis_exp.comparison.published import Row, Table, curves, scores
 from atlantis_exp.comparison.verdict import Answer, Question, answer, families, group_of
 from atlantis_exp.comparison.words import said
 from atlantis_exp.components import facts_of, title_of
-from atlantis_exp.decision import FEWEST_SEEDS, Look, Plan, Verdict, decide, equal_scores, mean_interval, modes
-from atlantis_exp.registry import Game
+from atlantis_exp.games import Game
 from atlantis_exp.statistics import Scores, human_normalised, probability_of_improvement, summarize
 
 Groups = Mapping[str, Sequence[Training]]

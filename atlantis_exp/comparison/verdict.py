@@ -13,8 +13,8 @@ from itertools import count, islice
 import numpy as np
 
 from atlantis_exp.checking import nearest
+from atlantis_exp.comparison.decision import Decision, Look, Plan, decide, looks_up_to
 from atlantis_exp.comparison.gather import COMMIT, Training, values_of
-from atlantis_exp.decision import Decision, Look, Plan, decide, looks_up_to
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.statistics import interquartile_mean
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from atlantis_exp.comparison.decision import Plan, Verdict
 from atlantis_exp.comparison.verdict import Answer
-from atlantis_exp.decision import Plan, Verdict
 
 _IN_FULL = 3  # pairs of a family, up to which each is said with its interval
 _LISTED = 6  # undecided pairs, up to which they are named

@@ -244,20 +244,9 @@ class Learner(ActionValues):
         """Continue exactly where the learner stood that `state_dict` described.
 
         Raises:
-            ValueError: where what the optimizer keeps of one parameter is not of the form of the others'.
+            ValueError: where the next update would break off.
         """
-        parameters = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
         kept = {int(index): values for index, values in state["optimizer"].items()}
-        names = {frozenset(values) for values in kept.values()}
-        of_its_size = {
-            frozenset(
-                name for name, value in values.items() if getattr(value, "shape", None) == parameters[index].shape
-            )
-            for index, values in kept.items()
-            if parameters[index].dim()  # a parameter that is one number is as large as the count of its steps
-        }
-        if len(names) > 1 or len(of_its_size) > 1:  # torch's load takes it, and the next update breaks off
-            raise ValueError("the optimizer's state does not fit its parameters")
         self.network.load_state_dict(state["network"])
         self.target.load_state_dict(state["target"])
         self.optimizer.load_state_dict(
@@ -269,16 +258,40 @@ class Learner(ActionValues):
         self.learning_rate = state["learning_rate"]
         for name, generator in self._generators().items():
             generator.set_state(state["generators"][name].cpu())
-        self.updates = state["updates"]
+        self._check_optimizer()
+        self.updates, self._measured = int(state["updates"]), int(state["measured"])
+        if not 0 <= self._measured <= self.updates < 2**53:
+            raise ValueError(f"{self._measured} of {self.updates} updates are measured")
         self._has_begun_with = state.get("has_begun_with", False)
         self._sums.copy_(state["sums"])
-        self._measured = state["measured"]
         self._first_nonfinite.copy_(state["first_nonfinite"])
         if self.ema:
             self.evaluated.load_state_dict(state["evaluated"])
             self._evaluated.refresh()
         self._online.refresh()
         self._target.refresh()
+
+    def _check_optimizer(self) -> None:
+        """Compare what the optimizer has loaded with what it keeps after a step; torch does not. Raises: ValueError."""
+
+        def form(optimizer: torch.optim.Optimizer) -> dict[int, dict[str, object]]:
+            state = optimizer.state_dict()["state"].items()
+            return {
+                index: {
+                    name: isinstance(value, torch.Tensor) and (value.shape, value.dtype) for name, value in kept.items()
+                }
+                for index, kept in state
+            }
+
+        trial = copy.deepcopy(self.optimizer)
+        trial.state.clear()
+        for group in trial.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = torch.zeros_like(parameter) if parameter.requires_grad else None
+        trial.step()
+        steps = [kept["step"].item() for kept in self.optimizer.state.values() if "step" in kept]
+        if self.optimizer.state and (form(self.optimizer) != form(trial) or not all(step >= 0 for step in steps)):
+            raise ValueError("the optimizer's state does not fit its parameters")
 
     def _measure(self, means: torch.Tensor) -> None:
         gradient_norm = nn.utils.get_total_norm([p.grad for p in self.network.parameters() if p.grad is not None])

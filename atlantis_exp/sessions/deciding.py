@@ -20,12 +20,12 @@ from atlantis_exp import terminal
 from atlantis_exp.build import build_trainer
 from atlantis_exp.checking import digest, flatten, to_dict
 from atlantis_exp.comparison.comparing import compare
+from atlantis_exp.comparison.decision import detectable, equivalence, looks_up_to
 from atlantis_exp.comparison.gather import mixed_protocol, resolve, shortened, values_in
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.comparison.tables import Comparison
 from atlantis_exp.comparison.verdict import Group, Question, families, wanted
 from atlantis_exp.config import Config
-from atlantis_exp.decision import detectable, equivalence, looks_up_to
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
 from atlantis_exp.runs.folder import RunFolder

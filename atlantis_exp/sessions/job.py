@@ -2,8 +2,9 @@
 
 import re
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 
 from atlantis_exp.config import Config
@@ -79,3 +80,13 @@ def config_colour(config: Config) -> str:
 def labels(title: str, colour: str, kind: str) -> dict[str, str]:
     """The tags by which MLflow shows a run, and tells trainings, sweeps, comparisons apart."""
     return {"mlflow.runName": title, "mlflow.runColor": colour, "atlantis.kind": kind}
+
+
+def fitted(lines: Sequence[str], room: int, rest: str) -> str:
+    """Return as many lines of a note as have room, in characters, then how many more are in `rest`."""
+    text = "\n".join(lines)
+    if len(text) <= room:
+        return text
+    more = f"\n\n... and {{:,}} more in {rest}."
+    kept = sum(end <= room - len(more) - 5 for end in accumulate(len(line) + 1 for line in lines))
+    return "\n".join(lines[:kept]) + more.format(len(lines) - kept)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch
+from rich.text import Text
 from torch import nn
 
 from atlantis_exp.build import build_trained_network
@@ -74,7 +75,8 @@ def export_onnx(config: Config, weights: bytes) -> Exported:
         assert program is not None
         content: bytes = program.model_proto.SerializeToString()
     except torch.onnx.OnnxExporterError as error:
-        raise Fault(f"the network cannot be written as ONNX: {str(error).splitlines()[0]}") from error
+        reason = " ".join(Text.from_ansi(str(error)).plain.split())
+        raise Fault(f"the network cannot be written as ONNX: {reason}") from error
     finally:
         logging.disable(before)
     here, there = _both(config, network, content)

@@ -32,11 +32,11 @@ from atlantis_exp.build import stream
 from atlantis_exp.checking import digest
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
-from atlantis_exp.runs.files import ARTIFACT, read_file
+from atlantis_exp.runs.files import ARTIFACT, own, read_file
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Metrics, Status, adopt, fitted
+from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Metrics, Status, adopt
 from atlantis_exp.runs.lock import alone
-from atlantis_exp.sessions.job import Job, command_line, labels, replaced
+from atlantis_exp.sessions.job import Job, command_line, fitted, labels, replaced
 from atlantis_exp.sessions.page import ending, opened
 from atlantis_exp.sessions.stopping import StopRequest
 from atlantis_exp.sessions.training import train
@@ -112,7 +112,8 @@ class Trials:
     def __init__(self, asked: Search, train: Train = train) -> None:
         config = asked.corner.config
         facts = {"space": dict(asked.texts), "training": config.science(), "budget.steps": config.budget.steps}
-        facts["seeds"] = asked.seeds
+        if asked.seeds > 1:  # an older search names none
+            facts["seeds"] = asked.seeds
         name = asked.name or f"search-{digest(facts)}"
         self.asked, self._train = asked, train
         self.folder = RunFolder(asked.corner.outputs / "searches" / name)
@@ -314,6 +315,7 @@ def _study(file: Path, asked: Search) -> Study:
     after = asked.pruned_after
     try:
         if file.exists():
+            own(file)  # Optuna writes it in place
             lock = JournalFileSymlinkLock(str(file))  # all processes write under it
             lock.acquire()
             try:  # to drop the end of a line that a process was killed in: the next would be written behind it

@@ -14,10 +14,9 @@ from atlantis_exp import terminal
 from atlantis_exp.checking import digest
 from atlantis_exp.faults import Fault
 from atlantis_exp.media import curves, strips
-from atlantis_exp.registry import TABLE_COLUMNS
-from atlantis_exp.runs.folder import TRACEBACK, RunFolder, State
-from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, adopt, curve, fitted
-from atlantis_exp.sessions.job import Job
+from atlantis_exp.runs.folder import TABLE_COLUMNS, TRACEBACK, RunFolder, State
+from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, adopt, curve
+from atlantis_exp.sessions.job import Job, fitted
 from atlantis_exp.sessions.launchers import BASIC, Launcher, joblib, ray, slurm
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.page import ending, opened, terminable

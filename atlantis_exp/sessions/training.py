@@ -16,7 +16,7 @@ from atlantis_exp import terminal
 from atlantis_exp.build import build_trained_network, build_trainer, choose_device, described, import_components
 from atlantis_exp.checking import flatten, to_dict
 from atlantis_exp.config import Config
-from atlantis_exp.faults import ConfigError, Fault, RunFault
+from atlantis_exp.faults import ConfigError, Fault, RunFault, remedied
 from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import CONFIG, LOST, TRACEBACK, Result, RunFolder, all_runs
 from atlantis_exp.runs.journal import Journal, adopt, has_lost_commit
@@ -140,8 +140,6 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
     if state is not None:
         with unforged(folder.checkpoints):
             done = Counters.of(state["counters"])
-            if not 0 <= done.episodes <= done.steps < 2**53:
-                raise ValueError(f"{done.episodes} episodes in {done.steps} steps")
     if state is None:
         if (weights := _initial_weights(config)) is not None:
             trainer.learner.begin_with(weights)
@@ -229,7 +227,7 @@ def _faults_recorded(job: Job, folder: RunFolder, journal: Journal) -> Iterator[
             write_file(folder.path / TRACEBACK, traceback.format_exc().encode())
             journal.status("FAILED", str(error) or type(error).__name__)
         if isinstance(error, RunFault | OSError):
-            raise Fault(f"run {folder.name}: {error}; continue with: {job.command}") from error
+            raise Fault(f"run {folder.name}: {remedied(error)}; continue with: {job.command}") from error
         if job.config.compile and _is_of_compilation(error):
             reason = str(error).strip().partition("\n")[0]
             raise Fault(f"run {folder.name}: torch.compile failed, {reason}; compile=false does without") from error

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from atlantis_exp.decision import Plan
+from atlantis_exp.comparison.decision import Plan
 from benchmarks import decisions
 
 

@@ -43,7 +43,7 @@ Command = Callable[..., int]
         ),
         (("model=cnn,resnet", "delta=5pt"), "delta=5pt: write a share of a score, as in delta=5%, or points"),
         (("model=cnn,resnet", "seeds=4"), "seeds=4: should be greater than or equal to 5"),
-        (("model=cnn,resnet", "error=0"), "error=0: should be greater than 0"),
+        (("model=cnn,resnet", "error=0"), "error=0: should be greater than or equal to 1e-06"),
         (("model=cnn,resnet", "look=now"), "look=now: no such key"),
         (("model=cnn,resnet", "evaluation.at_end=false"), "evaluation.at_end=false: contenders are compared by the "),
         (("model=cnn,resnet", "hydra/launcher=joblb"), "In 'hydra/config': Could not find 'hydra/launcher/joblb'"),

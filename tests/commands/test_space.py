@@ -45,7 +45,7 @@ def test_a_space_is_written_as_for_hydras_optuna_sweeper(text: str, drawn: BaseD
     [
         ("", "optimizer=adam,rmsprpo", "optimizer=rmsprpo: no such option in conf/optimizer; did you mean 'rmsprop'?"),
         ("", "optimizer.l=0.1,0.2", "did you mean 'optimizer.lr'?"),
-        ("", "optimizer.lr=interval(-1,1)", "optimizer.lr=-1.0: should be greater than 0"),
+        ("", "optimizer.lr=interval(-1,1)", "optimizer.lr=-1.0: should be greater than or equal to "),
         ("", "optimizer.lr=interval(2,1)", "`low <= high` must hold"),
         ("", "optimizer.lr=tag(log,interval(0,1))", "`low > 0` must hold"),
         ("", "optimizer.lr=range(1,1)", "there is no number in it"),

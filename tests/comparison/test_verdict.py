@@ -16,13 +16,13 @@ import pytest
 
 from atlantis_exp.commands.compare import VERB
 from atlantis_exp.comparison import comparing
+from atlantis_exp.comparison.decision import Look, mean_interval
 from atlantis_exp.comparison.figures import draw
 from atlantis_exp.comparison.gather import PROTOCOL, Gathered, Training, gather, group
 from atlantis_exp.comparison.report import page, plain
 from atlantis_exp.comparison.tables import Comparison, compare, to_csv
 from atlantis_exp.comparison.verdict import Group, Question, answer, families, group_of, wanted
 from atlantis_exp.comparison.words import spent
-from atlantis_exp.decision import Look, mean_interval
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.folder import RunFolder

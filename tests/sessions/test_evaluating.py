@@ -26,7 +26,7 @@ from atlantis_exp.sessions import evaluating
 from atlantis_exp.sessions.evaluating import _held, _placeable, play, play_baseline
 from atlantis_exp.sessions.reporting import report
 from atlantis_exp.sessions.window import Window
-from atlantis_exp.tracking.store import PLACE
+from atlantis_exp.tracking.mirror import PLACE
 
 Capture = pytest.CaptureFixture[str]
 Command = Callable[..., int]

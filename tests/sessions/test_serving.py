@@ -24,7 +24,8 @@ from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.sweep import ledger
 from atlantis_exp.sessions.training import train
-from atlantis_exp.tracking.store import Store, publish
+from atlantis_exp.tracking.mirror import publish
+from atlantis_exp.tracking.store import Store
 
 REPOSITORY = Path(__file__).parents[2]
 pytestmark = pytest.mark.slow
@@ -106,7 +107,7 @@ def test_no_text_of_a_run_runs_a_script_in_mlflows_pages(page: Any, address: str
     journal.flush()
     journal.status("FAILED", SCRIPT)
     publish(folder, Store(outputs))
-    (run,) = [run.run_id for run in Store(outputs).runs() if run.name == SCRIPT]
+    (run,) = [run.info.run_id for run in Store(outputs).runs() if run.info.run_name == SCRIPT]
     runs = address.partition("?")[0]
     for place in (address, f"{runs}/{run}"):
         page.goto("about:blank")
@@ -121,7 +122,7 @@ def test_no_text_of_a_run_runs_a_script_in_mlflows_pages(page: Any, address: str
 def run_id(outputs: Path) -> Callable[[str], str]:
     """The id of the run whose name starts so."""
     runs = Store(outputs).runs()
-    return lambda start: min(run.run_id for run in runs if run.name.startswith(start))
+    return lambda start: min(run.info.run_id for run in runs if run.info.run_name.startswith(start))
 
 
 def size_of(image: Any) -> list[int]:
@@ -157,7 +158,7 @@ def test_the_first_chart_shows_the_score_of_every_run(page: Any, address: str, o
     chart = page.locator(".js-plotly-plot:has(.barlayer)").first
     chart.locator(".bartext").first.wait_for()
     store = Store(outputs)
-    metrics = [store.client.get_run(run.run_id).data.metrics for run in store.runs()]
+    metrics = [run.data.metrics for run in store.runs()]
     scores = [each["evaluation/interquartile_mean"] for each in metrics if "evaluation/interquartile_mean" in each]
     assert sorted(chart.locator(".bartext").all_text_contents()) == sorted(f"{score:.2f}" for score in scores)
 

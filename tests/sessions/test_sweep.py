@@ -20,7 +20,7 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import NOTE, Artifact, Journal, Tags, read_commit
-from atlantis_exp.sessions.job import Job, replaced
+from atlantis_exp.sessions.job import Job, fitted, replaced
 from atlantis_exp.sessions.launchers import Launcher
 from atlantis_exp.sessions.sweep import _every, ledger
 from atlantis_exp.sessions.training import train
@@ -282,3 +282,15 @@ def test_a_sweep_that_is_not_tracked_leaves_nothing_but_its_runs(tiny: Compose) 
     with ledger([Job(config), Job(tiny("seed=1"))], ["seed=0,1"]):
         pass
     assert not list(Path(config.paths.outputs).iterdir())
+
+
+@pytest.mark.parametrize("room", [0, 59, 60, 200, 1_099, 1_100])
+def test_a_table_in_a_note_keeps_to_its_room_and_says_what_it_leaves_out(room: int) -> None:
+    lines = [f"line {number:05}" for number in range(100)]  # 100 x 10 characters, and 99 ends
+    text = fitted(lines, room, "`x.csv`")
+    kept, _, left = text.partition("\n\n... and ")
+    shown = kept.splitlines()
+    assert shown == lines[: len(shown)]
+    assert left == ("" if room >= 1_099 else f"{100 - len(shown)} more in `x.csv`.")
+    assert len(text) <= max(room, 60)
+    assert len(shown) >= (room - 60) // 11

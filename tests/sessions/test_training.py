@@ -29,8 +29,9 @@ from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.reporting import report
 from atlantis_exp.sessions.training import train
 from atlantis_exp.sessions.verifying import Session, fingerprints, run_and_kill, start, train_and_kill
+from atlantis_exp.tracking.mirror import publish
 from atlantis_exp.tracking.publishing import catch_up
-from atlantis_exp.tracking.store import Store, publish
+from atlantis_exp.tracking.store import Store
 from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints
 from atlantis_exp.training.forecast import Forecast
 from atlantis_exp.training.plan import Counters

@@ -13,7 +13,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
-from atlantis_exp.decision import (
+from atlantis_exp.comparison.decision import (
     Decision,
     Look,
     Plan,
