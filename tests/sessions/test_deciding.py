@@ -288,32 +288,42 @@ def said(contest: Contest, capsys: pytest.CaptureFixture[str]) -> str:
     return capsys.readouterr().out
 
 
-@pytest.mark.slow
-def test_before_it_starts_it_says_runs_hours_and_what_it_can_find(
+def test_before_it_starts_it_says_how_many_runs_there_may_be_and_what_they_can_find(
     asking: Asking, recorded: Recorded, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    contest = asking("model=cnn,resnet_fast", "delta=5%")
+    assert said(contest, capsys).splitlines() == [
+        "cnn, resnet_fast: 10 to 20 runs, looks at 5 and 10 seeds each; 0 are there.",
+        "a difference of 12 % of the score is found, and no difference where delta is 14 % or more, with 80 % at 10 "
+        "seeds",
+        "(if a contender's seeds differ as published ones do (Dopamine's agents, five seeds): 9 % of their mean, "
+        "standard deviation)",
+    ]
+    record_seeds(recorded, 1_000, range(2), "model=cnn")
+    assert "published" in said(contest, capsys)
+    for seed, score in ((2, 900.0), (3, 1_100.0)):
+        recorded("model=cnn", f"seed={seed}", scores=(score, score, score, score))
+    assert said(contest, capsys).splitlines() == [
+        "cnn, resnet_fast: 10 to 20 runs, looks at 5 and 10 seeds each; 4 are there.",
+        "a difference of 11 % of the score is found, and no difference where delta is 13 % or more, with 80 % at 10 "
+        "seeds",
+        "(if a contender's seeds differ as those that are there do: 8 % of their mean, standard deviation)",
+    ]
+    shown = said(asking("model=cnn,resnet_fast", "sampler=uniform,top_half", "seeds=5"), capsys).splitlines()
+    assert shown[0].endswith("20 runs, looks at 5 seeds each; 4 are there.")
+    assert [line.partition(" is found")[0] for line in shown[1:-1]] == [
+        "by model, a difference of 14 % of the score",
+        "by sampler, a difference of 14 % of the score",
+        "by model,sampler, a difference of 27 % of the score",
+    ]
+
+
+@pytest.mark.slow
+def test_before_it_starts_it_says_what_hours_the_runs_take(asking: Asking, capsys: pytest.CaptureFixture[str]) -> None:
     shown = said(asking("model=cnn,resnet_fast", "budget.forecast=warn"), capsys)
-    assert "cnn, resnet_fast: 10 to 20 runs, looks at 5 and 10 seeds each; 0 are there." in shown
     assert re.search(r"^ *cnn: [\d,]+ (seconds|minutes) a run, alone on this machine", shown, re.MULTILINE)
     assert re.search(r"resnet_fast: [\d,]+ (seconds|minutes) a run, alone on this machine", shown)
     assert re.search(r"at most [\d,]+ (seconds|minutes) where they run one after the other", shown)
-    assert "\na difference of 12 % of the score is found with 80 % at 10 seeds\n" in shown
-    assert "published ones do (Dopamine's agents, five seeds)" in shown
-
-    record_seeds(recorded, 1_000, range(2), "model=cnn")
-    assert "published" in said(asking("model=cnn,resnet_fast"), capsys)
-    for seed, score in ((2, 900.0), (3, 1_100.0)):
-        recorded("model=cnn", f"seed={seed}", scores=(score, score, score, score))
-    shown = said(asking("model=cnn,resnet_fast"), capsys)
-    assert "; 4 are there." in shown
-    assert "if a contender's seeds differ as those that are there do: 8 % of their mean" in shown
-    assert "a difference of 11 % of the score is found with 80 % at 10 seeds" in shown
-
-    shown = said(asking("model=cnn,resnet_fast", "delta=5%"), capsys)
-    assert "is found, and no difference where delta is 13 % or more, with 80 % at 10 seeds" in shown
-    shown = said(asking("model=cnn,resnet_fast", "sampler=uniform,top_half"), capsys)
-    assert "by model, a difference of " in shown
-    assert "by model,sampler, a difference of " in shown
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import os
 import signal
 import sqlite3
 import subprocess
@@ -24,6 +25,7 @@ from atlantis_exp.sessions.job import Job, fitted, replaced
 from atlantis_exp.sessions.launchers import Launcher
 from atlantis_exp.sessions.sweep import _every, ledger
 from atlantis_exp.sessions.training import train
+from atlantis_exp.tracking.publishing import catch_up
 
 Compose = Callable[..., Config]
 REPOSITORY = Path(__file__).parents[2]
@@ -69,10 +71,10 @@ def test_a_page_tells_of_each_run_how_far_it_is_and_why_it_failed(
     done.write_result(dataclasses.replace(result, counts={"hours": 1.5, "episodes": 7}))
     Journal(failed.path).status("FAILED", "no device")
     (failed.path / "traceback.txt").write_text("...")
-    Journal(unsaid.path).status("FAILED", "no space")
     with ledger([*jobs, jobs[0]], ["seed=0,1,2,3,4"], ELSEWHERE, "train -m seed=0,1,2,3,4"):
         assert page_of(tmp_path).status == "RUNNING"
         assert note_of(page_of(tmp_path)).count("\n| cnn uniform s") == 5
+        Journal(unsaid.path).status("FAILED", "no space")
     page = page_of(tmp_path)
     assert (page.status, page.title) == ("FAILED", "sweep seed=0,1,2,3,4")
     assert page.error == f"2 of 5 runs failed\n{failed.name}: no device\n{unsaid.name}: no space"
@@ -99,7 +101,7 @@ def test_a_page_tells_of_each_run_how_far_it_is_and_why_it_failed(
     artifacts = {record.path for record in page.records() if isinstance(record, Artifact)}
     assert artifacts == {"runs.csv"}
     shown = capsys.readouterr().out.splitlines()
-    assert shown[:6] == shown[-6:]  # before and after
+    assert "sweep of 5 runs: 2 done, 1 failed, 2 queued" in shown  # before
     assert shown[-6:] == [
         f"  done        {done.name}",
         f"  done        {without_hours.name}",
@@ -108,6 +110,18 @@ def test_a_page_tells_of_each_run_how_far_it_is_and_why_it_failed(
         f"  queued      {queued.name}",
         "sweep of 5 runs: 2 done, 2 failed, 1 queued",
     ]
+
+
+def test_reasons_take_a_quarter_of_the_note_at_most(tiny: Compose, tmp_path: Path) -> None:
+    jobs = [Job(tiny(f"seed={seed}")) for seed in range(6)]
+    for job in jobs:
+        Journal(RunFolder.of(job.config).path).status("FAILED", "x" * 600)
+    with ledger(jobs, [], ELSEWHERE):
+        pass
+    note = note_of(page_of(tmp_path))
+    assert note.count("x" * 600) == 3
+    assert "... and 3 more in `runs.csv`.\n\n| run |" in note
+    assert note.count("| failed |") == 6
 
 
 @pytest.mark.parametrize(
@@ -256,15 +270,48 @@ def test_a_sweep_that_a_signal_ends_is_closed(tiny: Compose, tmp_path: Path, num
     assert page_of(tmp_path).status == "KILLED"
 
 
-def test_a_larger_sweep_takes_the_runs_of_a_smaller_one_over(pair: list[Job], tiny: Compose) -> None:
+def test_a_larger_sweep_takes_the_runs_of_a_smaller_one_over(
+    pair: list[Job], tiny: Compose, capsys: pytest.CaptureFixture[str]
+) -> None:
     with ledger(pair, ["seed=0,1"]):
         pass
+    shown = [line for line in capsys.readouterr().out.splitlines() if not line.startswith("publishing")]
+    assert len(shown) == 6  # two tables: what trains here shows itself
     small = {read_commit(path).parent for path in (pair[0].outputs / "runs").iterdir()}  # type: ignore[union-attr]
     with ledger([*pair, Job(tiny(*SHORT, "seed=2"))], ["seed=0,1,2"]):
         pass
     large = {read_commit(path).parent for path in (pair[0].outputs / "runs").iterdir()}  # type: ignore[union-attr]
     assert len(small) == len(large) == 1
     assert small != large
+
+
+def test_a_launchers_sweep_marks_what_was_killed_before_it(tiny: Compose, tmp_path: Path) -> None:
+    Journal(tmp_path / "runs" / "killed").status("RUNNING")
+    with ledger([Job(tiny())], [], ELSEWHERE):
+        assert RunFolder(tmp_path / "runs" / "killed").status == "KILLED"
+
+
+@pytest.mark.slow
+def test_a_launchers_sweep_publishes_the_runs_that_other_processes_train(
+    pair: list[Job], recorded: Callable[..., Path]
+) -> None:
+    outputs = pair[0].outputs
+    with ledger(pair, ["seed=0,1"], ELSEWHERE):
+        recorded(*SHORT, "seed=1")
+    for _ in range(5):
+        catch_up(outputs)  # a busy machine may not have sent all of it in time
+    assert len(rows(outputs, "SELECT name FROM runs")) == 2
+
+
+def test_a_sweep_of_joblibs_shares_the_cores_among_its_jobs(
+    tiny: Compose, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("joblib", reason="the extra joblib is not installed")
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    with ledger([Job(tiny("seed=0")), Job(tiny("seed=1"))], ["seed=0,1"], Launcher("joblib", n_jobs=2)):
+        assert "OMP_NUM_THREADS" in os.environ
+    assert "OMP_NUM_THREADS" not in os.environ
+    assert page_of(tmp_path).status == "KILLED"  # nobody trained
 
 
 def test_a_sweep_that_is_not_tracked_leaves_nothing_but_its_runs(tiny: Compose) -> None:
