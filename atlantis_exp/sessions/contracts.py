@@ -28,6 +28,7 @@ from atlantis_exp.networks.sizes import count_parameters
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.sessions.training import expected
 from atlantis_exp.sessions.verifying import fingerprints, train_and_kill
 from atlantis_exp.training.checkpoint import to_safetensors
@@ -290,6 +291,7 @@ def _costs(jobs: Sequence[Job]) -> Table:
         column.justify = "right"
     for job in jobs:
         config = job.config
+        set_up_torch(config, config.device)
         learner, size, stack = build_learner(config), config.env.size, config.env.stack
         batch = config.training.batch_size
         states = np.random.default_rng(0).integers(0, 256, (batch, stack, size, size), np.uint8)
@@ -301,7 +303,7 @@ def _costs(jobs: Sequence[Job]) -> Table:
             updates += 1
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder)
-            trainer = build_trainer(config, path, Journal(path), Progress(terminal.console()))
+            trainer = build_trainer(config, job.machine.cores, path, Journal(path), Progress(terminal.console()))
             with trainer.emulators:
                 steps = expected(trainer, config, Counters()).steps_per_second
         counts = f"{count_parameters(learner.network):,}", f"{flops / 1e6:,.0f} M"

@@ -33,6 +33,7 @@ from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal, Metrics, NullJournal
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.job import Job, command_line, labels, quoted
+from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.sessions.sweep import ledger, terminable
 from atlantis_exp.sessions.training import expected, train
 from atlantis_exp.tracking.publishing import catch_up, publishing
@@ -320,9 +321,13 @@ class _Session:
 
     def _forecast(self, label: str) -> float:
         """The hours that a contender's training takes here."""
-        config = self.job(label, 0).config
+        job = self.job(label, 0)
+        config = job.config
+        set_up_torch(config, config.device)
         with tempfile.TemporaryDirectory() as aside:
-            trainer = build_trainer(config, Path(aside), NullJournal(), Progress(Console(quiet=True)))
+            trainer = build_trainer(
+                config, job.machine.cores, Path(aside), NullJournal(), Progress(Console(quiet=True))
+            )
             with trainer.emulators:
                 return expected(trainer, config, Counters()).hours
 

@@ -30,6 +30,7 @@ def export(
     device: str,
     evaluation: EvaluationConfig,
     paths: PathsConfig,
+    cores: int,
 ) -> None:
     """Play the network as it will be handed on, then write it with a card of how it was made and what it scored."""
     if onnx:
@@ -54,7 +55,7 @@ def export(
     settings = replace(evaluation, video=False, num_envs=evaluation.at_once)
     progress = Progress()
     progress.say(f"{source.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
-    played = build_evaluator(trained.env, settings)(actor, settings.episodes, progress)
+    played = build_evaluator(trained.env, settings, cores)(actor, settings.episodes, progress)
     card = Card(
         format=1,
         run=source.name,

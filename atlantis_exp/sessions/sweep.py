@@ -21,7 +21,7 @@ from atlantis_exp.runs.folder import TRACEBACK, RunFolder, State
 from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, adopt, curve, fitted
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.job import Job
-from atlantis_exp.sessions.launchers import BASIC, Launcher, joblib, ray, slurm
+from atlantis_exp.sessions.launchers import BASIC, Launcher, joblib, slurm
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.tracking.publishing import catch_up, publishing
 
@@ -134,8 +134,6 @@ def _launched(
     match launcher.name:
         case "joblib":
             context: AbstractContextManager[None] = joblib.jobs(journal, jobs, close_page, launcher)
-        case "ray":
-            context = ray.jobs(journal, folders, close_page, launcher)
         case "slurm":
             context = slurm.all_awaited()
         case _:

@@ -115,7 +115,7 @@ def test_a_job_that_fails_is_shown_as_failed_with_its_error_and_so_is_its_sweep(
 
 @pytest.mark.parametrize("how", ["exit", "terminated", "interrupted"])
 def test_a_sweep_that_is_cut_short_is_closed(pair: list[Job], how: str) -> None:
-    of_term = signal.getsignal(signal.SIGTERM)  # Ray's, where an earlier test of this process used it
+    of_term = signal.getsignal(signal.SIGTERM)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background job lacks
 
     def sweep() -> None:
