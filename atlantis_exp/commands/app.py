@@ -4,7 +4,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, NoReturn, TypeVar
 
 import hydra
@@ -17,8 +17,9 @@ from atlantis_exp.commands import CONF
 from atlantis_exp.commands.composing import admit, checked
 from atlantis_exp.commands.overrides import check, is_run, launcher, located, refuse_twice
 from atlantis_exp.faults import Fault, remedied
+from atlantis_exp.machine import Machine, here
 from atlantis_exp.sessions.job import command_line
-from atlantis_exp.sessions.launchers import Launcher, job_apart
+from atlantis_exp.sessions.launchers import Launcher
 
 T = TypeVar("T")
 
@@ -32,6 +33,7 @@ class Asked(Generic[T]):
     overrides: tuple[str, ...]  # of this job alone, where it is one of a sweep
     launcher: str | None = None  # of the sweep that this process does one job of, but for Hydra's own
     typed: tuple[str, ...] = ()  # all arguments, before they became overrides; empty in a launcher's worker
+    machine: Machine = field(default_factory=here)
 
     @property
     def command(self) -> str:
@@ -73,7 +75,7 @@ class Verb(Generic[T]):
             if is_run(arguments):  # which Hydra itself would compose twice more
                 ((overrides, config),) = jobs.items()
                 with terminal.working(f"{self.name}: loading"):
-                    call = self.work(Asked(config, self.name, (*flags, *overrides), job_apart(), typed))
+                    call = self.work(Asked(config, self.name, (*flags, *overrides), here().launcher, typed))
                 call()
                 return
         except (Fault, OSError) as error:
@@ -117,7 +119,7 @@ def _is_sweep() -> bool:
 
 def _job_launcher() -> str | None:
     """The launcher that this process does one job of a sweep for; None where that is Hydra's own, or there is none."""
-    if (apart := job_apart()) is not None:
+    if (apart := here().launcher) is not None:
         return apart
     if not _is_sweep():
         return None

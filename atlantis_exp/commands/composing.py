@@ -40,8 +40,6 @@ def _outputs_folder() -> str:
 # Our presets reuse the plugins' names so that the plugins validate the keys; Hydra warns.
 warnings.filterwarnings("ignore", message=r"\n'hydra/launcher/\w+' is validated against ConfigStore schema")
 OmegaConf.register_new_resolver("outputs_folder", _outputs_folder, replace=True)
-# Of a Ray cluster that is started here, bytes, the least that Ray takes; a running cluster (a string) has its own.
-OmegaConf.register_new_resolver("ray_object_store", lambda address: None if address else 78_643_200, replace=True)
 
 
 def _head_for(objective: str, other: str = "plain") -> str:

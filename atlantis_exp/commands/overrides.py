@@ -113,9 +113,7 @@ def launcher(config_name: str, arguments: Sequence[str]) -> Launcher:
     with composing(config_dir(arguments)):
         settings = compose(config_name, hydras, return_hydra_config=True).hydra
     name, n_jobs = settings.runtime.choices["hydra/launcher"], OmegaConf.select(settings, "launcher.n_jobs")
-    if (ray := OmegaConf.select(settings, "launcher.ray.init")) is None:
-        return Launcher(name, n_jobs)
-    return Launcher(name, n_jobs, {str(key): ray[key] for key in ray})
+    return Launcher(name, n_jobs)
 
 
 def _check_launcher(config_name: str, overrides: list[Override]) -> None:

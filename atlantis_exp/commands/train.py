@@ -23,10 +23,6 @@ def _work(asked: Asked[Config]) -> Callable[[], object]:
             from atlantis_exp.sessions.launchers.joblib import train_apart
 
             return partial(train_apart, job)
-        case "ray":
-            from atlantis_exp.sessions.launchers.ray import train_there
-
-            return partial(train_there, job)
         case _:
             from atlantis_exp.sessions.launchers.slurm import train_as_job
 

@@ -17,7 +17,7 @@ from atlantis_exp.media import curves, strips
 from atlantis_exp.runs.folder import TABLE_COLUMNS, TRACEBACK, RunFolder, State
 from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, adopt, curve
 from atlantis_exp.sessions.job import Job, fitted
-from atlantis_exp.sessions.launchers import BASIC, Launcher, joblib, ray, slurm
+from atlantis_exp.sessions.launchers import BASIC, Launcher, joblib, slurm
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.page import ending, opened, terminable
 from atlantis_exp.tracking.publishing import catch_up
@@ -120,8 +120,6 @@ def _launched(launcher: Launcher, journal: Journal, runs: Runs, close_page: Call
     match launcher.name:
         case "joblib":
             context: AbstractContextManager[None] = joblib.jobs(journal, jobs, close_page, launcher)
-        case "ray":
-            context = ray.jobs(journal, folders, close_page, launcher)
         case "slurm":
             context = slurm.all_awaited()
         case _:

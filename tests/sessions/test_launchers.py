@@ -11,12 +11,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 from rich.console import Console
 
-from atlantis_exp.build import build_emulators
 from atlantis_exp.commands.overrides import check, launcher
 from atlantis_exp.config import Config, PathsConfig
 from atlantis_exp.faults import ConfigError, Fault
@@ -25,7 +23,6 @@ from atlantis_exp.runs.journal import Journal, read_commit
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.launchers import BASIC, Launcher
 from atlantis_exp.sessions.launchers.joblib import _shared_cores, train_apart
-from atlantis_exp.sessions.launchers.ray import _start
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.training import train
 from atlantis_exp.sessions.verifying import fingerprints
@@ -129,17 +126,6 @@ def test_jobs_share_the_cores_of_the_machine(
     with _shared_cores(Launcher("joblib", n_jobs), jobs):
         assert os.environ["OMP_NUM_THREADS"] == str(share)
     assert "OMP_NUM_THREADS" not in os.environ
-
-
-def test_emulator_workers_keep_to_their_share_and_leave_the_identity_alone(
-    tiny: Compose, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(3)))
-    config = tiny("env.num_envs=4")
-    for share, workers in (("2", 2), ("64", 3), ("", 3)):
-        monkeypatch.setenv("OMP_NUM_THREADS", share)
-        with build_emulators(config.env, 4) as emulators:
-            assert len(emulators._processes) == workers  # type: ignore[attr-defined]
 
 
 def test_the_table_follows_the_commits_of_runs(
@@ -280,51 +266,3 @@ def test_the_end_of_a_sweep_commits_its_jobs(sweep: Sweep, seeds: Callable[..., 
     assert [folder.status for folder in folders[:2]] == ["KILLED", "KILLED"]
     if how != "killed":
         assert statuses(configs[0]) == ["KILLED"] * 3
-
-
-def test_without_an_address_ray_starts_a_cluster_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where it would join one that another sweep has started on this machine."""
-    ray = pytest.importorskip("ray", reason="the extra ray is not installed")
-    for name in ("RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"):
-        monkeypatch.setenv(name, "0")
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    asked: list[object] = []
-    monkeypatch.setattr(ray, "init", lambda **settings: asked.append(settings["address"]))
-    _start({"address": None})
-    _start({"address": "127.0.0.1:6379"})
-    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:6380")
-    _start({"address": None})
-    assert asked == ["local", "127.0.0.1:6379", None]
-
-
-@pytest.mark.slow
-def test_on_a_ray_cluster_of_two_nodes_a_killed_workers_job_is_continued(
-    sweep: Sweep, seeds: Callable[..., list[Config]], tiny: Compose, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("hydra_plugins.hydra_ray_launcher", reason="the extra ray is not installed")
-    for name in ("RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"):
-        monkeypatch.setenv(name, "0")
-    monkeypatch.setenv("RAY_AUTH_TOKEN", "a" * 64)
-    from ray.cluster_utils import Cluster
-
-    node: dict[str, Any] = {"num_cpus": 1, "object_store_memory": 78_643_200}
-    cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
-    try:
-        cluster.add_node(**node)
-        words = (*FREQUENT, "phase.quick.steps=400", "resume=never")  # which is meant once
-        configs = seeds(*words)
-        process = sweep(
-            *words, "hydra/launcher=ray", f"hydra.launcher.ray.init.address={cluster.address}", "seed=0,1,2"
-        )
-        killed = RunFolder.of(configs[0])
-        wait_for(lambda: trains(killed))
-        os.kill(holder(killed), signal.SIGKILL)
-        assert process.wait(timeout=250) == 0, (tmp_path / "printed.txt").read_text()
-    finally:
-        cluster.shutdown()
-    assert "continuing run" in (killed.path / "output.txt").read_text()
-    assert statuses(configs[0]) == ["FINISHED"] * 4
-    paths = PathsConfig(outputs=str(tmp_path / "u"))
-    unbroken = dataclasses.replace(tiny(*words, "tracking=none"), paths=paths)
-    train(Job(unbroken))
-    assert fingerprints(configs[0], tmp_path / "o") == fingerprints(unbroken, tmp_path / "u")

@@ -4,17 +4,24 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
+from types import FrameType
+from typing import NoReturn
 
+from atlantis_exp import terminal
 from atlantis_exp.faults import Fault
+from atlantis_exp.machine import JOB_OF
 from atlantis_exp.runs.files import make_folder, no_link
 from atlantis_exp.runs.folder import OUTPUT, RunFolder
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
-from atlantis_exp.sessions.launchers import APART, JOB_OF, Launcher, committed_at_the_end
+from atlantis_exp.sessions.launchers import Launcher
 from atlantis_exp.sessions.stopping import sweep_goes_on
+
+_STOP_SECONDS = 300.0  # that jobs have to commit once their sweep ends
 
 
 @contextmanager
@@ -27,11 +34,42 @@ def jobs(
     with _shared_cores(launcher, trainings):
         for tracker in (resource_tracker, its_own):
             tracker.ensure_running()  # started later, it would lift the mask
-        # A worker that a signal ends would take all others along: they inherit the mask. The signals reach this
-        # process all the same, through its other threads.
-        folders = [RunFolder.of(job.config) for job in trainings]
-        with committed_at_the_end(journal, folders, close_page, is_masked=True):
+        with _committed_at_the_end(journal, [RunFolder.of(job.config) for job in trainings], close_page):
             yield
+
+
+@contextmanager
+def _committed_at_the_end(
+    journal: Journal, folders: Sequence[RunFolder], close_page: Callable[[], None]
+) -> Iterator[None]:
+    """Have all jobs commit before the sweep ends; after SIGINT or SIGTERM its exit code is a run's."""
+    own = [folder for folder in folders if not folder.is_held]
+
+    def stop() -> None:
+        close_page()  # it writes the journal, too
+        patience = time.monotonic() + _STOP_SECONDS
+        if any(folder.is_held for folder in own):
+            journal.status("KILLED")  # the jobs look at it
+            while any(folder.is_held for folder in own) and time.monotonic() < patience:
+                time.sleep(0.2)
+
+    def end(number: int, _: FrameType | None) -> NoReturn:
+        signal.signal(number, signal.SIG_DFL)  # a second one ends the process at once
+        terminal.warn(f"{signal.Signals(number).name}: the jobs commit and end")
+        stop()
+        sys.exit(128 + number)
+
+    handlers = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    # A worker that a signal ends would take all others along: they inherit the mask. The signals reach this process
+    # all the same, through its other threads.
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, handlers)
+    try:
+        yield
+    finally:
+        stop()
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 @contextmanager
@@ -64,7 +102,7 @@ def train_apart(job: Job) -> None:
         start = output.tell()
         code = subprocess.run(
             [sys.executable, "-m", "atlantis_exp", "train", *job.overrides],
-            env={**os.environ, JOB_OF: APART},
+            env={**os.environ, JOB_OF: "apart"},
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=output,

@@ -1,15 +1,15 @@
-"""Jobs of Slurm's, as their sweep's process sees them and as they are themselves."""
+"""Jobs of a Slurm cluster: what the sweep's process waits for, and what a job does."""
 
 import signal
 import sys
 import time
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from atlantis_exp import terminal
 from atlantis_exp.faults import Fault
 from atlantis_exp.sessions.job import Job
-from atlantis_exp.sessions.launchers import as_one_line
 
 _LOOK_SECONDS = 5.0  # between two questions to Slurm
 
@@ -18,7 +18,7 @@ _LOOK_SECONDS = 5.0  # between two questions to Slurm
 def all_awaited() -> Iterator[None]:
     """Wait for the other jobs where one that was cancelled or killed ends the launcher's own waiting.
 
-    Whoever interrupts the waiting reads that the jobs go on.
+    An interrupt ends the waiting and says that the jobs go on.
 
     Raises:
         Fault: names that job, or says why Slurm took none.
@@ -42,8 +42,13 @@ def all_awaited() -> Iterator[None]:
 
 
 def train_as_job(job: Job) -> None:
-    """Train as a job of Slurm's, or of whatever else has started this process. Raises: Fault where the run fails."""
+    """Train in a process that a launcher has started. Raises: Fault where the run fails."""
     from atlantis_exp.sessions.training import train  # and torch, which the sweep does without
 
-    with as_one_line(job.config.run_name()):
+    try:
         train(job)
+    except (Fault, OSError):
+        raise
+    except Exception as error:  # which may not travel to the sweep's process
+        traceback.print_exc()
+        raise Fault(f"run {job.config.run_name()}: {type(error).__name__}: {error}") from error
