@@ -27,7 +27,7 @@ from rich.console import Console
 
 from atlantis_exp.build import build_evaluator, build_trainer
 from atlantis_exp.config import Config
-from atlantis_exp.runs.journal import NullJournal
+from atlantis_exp.runs.journal import Tracker
 from atlantis_exp.training.actor import EpsilonGreedy, States
 from atlantis_exp.training.progress import Progress
 from benchmarks.composition import composed
@@ -73,7 +73,7 @@ def ours(judge: Judge) -> Iterator[Measure[Turn]]:
     quiet = ("evaluation.at_end=false", "evaluation.every_steps=null", "evaluation.video=false")
     config = composed("experiment=fast", *GAME, *quiet)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        trainer = build_trainer(config, Path(folder), NullJournal(), _QUIET)
+        trainer = build_trainer(config, Path(folder), Tracker(), _QUIET)
         stack.callback(trainer.emulators.close)
 
         def measure(seconds: float) -> Turn:

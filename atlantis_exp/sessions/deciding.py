@@ -30,7 +30,7 @@ from atlantis_exp.decision import detectable, equivalence, looks_up_to
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import Journal, Metrics, NullJournal
+from atlantis_exp.runs.journal import Journal, Metrics, Tracker
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.job import Job, command_line, labels, quoted
 from atlantis_exp.sessions.sweep import ledger, terminable
@@ -322,7 +322,7 @@ class _Session:
         """The hours that a contender's training takes here."""
         config = self.job(label, 0).config
         with tempfile.TemporaryDirectory() as aside:
-            trainer = build_trainer(config, Path(aside), NullJournal(), Progress(Console(quiet=True)))
+            trainer = build_trainer(config, Path(aside), Tracker(), Progress(Console(quiet=True)))
             with trainer.emulators:
                 return expected(trainer, config, Counters()).hours
 
