@@ -5,6 +5,7 @@ import io
 import json
 import logging
 import os
+import random
 import shutil
 import signal
 import sys
@@ -476,3 +477,48 @@ def test_what_training_refuses_as_forged_is_not_played_either(forged: Forged) ->
 def test_what_is_not_changed_goes_on(forged: Forged) -> None:
     train(Job(config := forged(lambda *_: None)))
     assert RunFolder.of(config).state == "done"
+
+
+def anywhere(seed: int) -> Callable[[State, ReplayMemory], None]:
+    """A forgery of any leaf of a state: a number or a text of a form that hurts, an array cut, retyped or filled."""
+
+    def change(state: State, _: ReplayMemory) -> None:
+        rng = random.Random(seed)
+        leaves: list[tuple[Any, Any]] = []
+
+        def walk(node: State) -> None:
+            for key, value in node.items():
+                if isinstance(value, dict) and value:
+                    walk(value)
+                else:
+                    leaves.append((node, key))
+
+        walk(state)
+        node, key = rng.choice(leaves)
+        if not isinstance(value := node[key], np.ndarray | torch.Tensor):
+            node[key] = rng.choice((*NUMBERS, *TEXTS, None, [], {}, True))
+            return
+        array = np.asarray(value).copy()
+        match rng.choice(("cut", "retype", "fill")):
+            case "cut":
+                array = array.reshape(-1)[1:]
+            case "retype":
+                array = array.astype(rng.choice((np.float32, np.int64, np.uint8, np.bool_)))
+            case _ if array.dtype.kind == "f":
+                array.fill(rng.choice((np.nan, np.inf, -1e30, 1e30, 0)))
+            case _:
+                array.fill(rng.choice((0, 1, 255 if array.dtype == np.uint8 else 2**40)))
+        node[key] = torch.from_numpy(array) if isinstance(value, torch.Tensor) else array
+
+    return change
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(200))
+def test_a_checkpoint_forged_anywhere_goes_on_or_is_one_line(
+    seed: int, forged: Forged, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = forged(anywhere(seed))
+    with soon(), suppress(Fault):
+        train(Job(config))
+    assert "Warning" not in capsys.readouterr().err

@@ -25,7 +25,7 @@ from atlantis_exp.components import known
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.replay.memory import Returns
-from atlantis_exp.runs.journal import NullJournal
+from atlantis_exp.runs.journal import Tracker
 from atlantis_exp.sessions.job import replaced
 from atlantis_exp.training.actor import ConstantActor, RandomActor
 from atlantis_exp.training.plan import Cadence, Counters
@@ -271,7 +271,7 @@ def test_without_a_terminal_a_line_now_and_then_says_how_far_a_training_is(monke
         cadence=unused,
         learner=cast(Any, learner),
         memory=unused,
-        tracker=NullJournal(),
+        tracker=Tracker(),
         progress=Progress(Console(file=text, width=80, soft_wrap=True)),
         evaluate=unused,
         film=unused,

@@ -29,7 +29,7 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import Journal, NullJournal
+from atlantis_exp.runs.journal import Journal, Tracker
 from atlantis_exp.sessions.job import Job, command_line, labels, quoted, replaced
 from atlantis_exp.sessions.page import opened, terminable
 from atlantis_exp.sessions.processor import set_up_torch
@@ -312,7 +312,7 @@ def _forecast(job: Job) -> float:
     config = job.config
     set_up_torch(config, config.device)
     with tempfile.TemporaryDirectory() as aside:
-        trainer = build_trainer(config, job.machine.cores, Path(aside), NullJournal(), Progress(Console(quiet=True)))
+        trainer = build_trainer(config, job.machine.cores, Path(aside), Tracker(), Progress(Console(quiet=True)))
         with trainer.emulators:
             return expected(trainer, config, Counters()).hours
 

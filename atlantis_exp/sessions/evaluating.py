@@ -1,4 +1,4 @@
-"""Any player played, its report printed, and the evaluation kept as a run of its own."""
+"""Let any player play, print its report, and keep the evaluation as a run of its own."""
 
 import re
 import shutil
@@ -112,14 +112,9 @@ def play_baseline(
     """Let a player without a network play, print the report's table, and record it all as the run `name`."""
     outputs = Path(paths.outputs)
     catch_up(outputs, tracking.uri)
-    facts = {
-        **({"plugins": {key: to_dict(each) for key, each in plugins.items()}} if plugins else {}),
-        "agent": to_dict(agent),
-        "env": to_dict(env),
-        "evaluation": to_dict(evaluation),
-        "tracking": to_dict(tracking),
-        "paths": to_dict(paths),
-    }
+    facts = _facts(agent=agent, env=env, evaluation=evaluation, tracking=tracking, paths=paths)
+    if plugins:
+        facts = {"plugins": _facts(**plugins), **facts}
     folder, shown = RunFolder(outputs / "runs" / name), labels(title, run_colour(agent.name), "baseline")
     with _held(folder):
         played = _play(f"{agent.name} player on {env.id}", build_baseline(agent, env), env, evaluation, cores)
@@ -147,14 +142,8 @@ def play(
     folder = RunFolder(next(path for name in names if not (path := outputs / "runs" / name).exists()))
     low, high = (env.frameskip, env.frameskip + 1) if isinstance(env.frameskip, int) else env.frameskip
     game, progress = facts_of(env.game), Progress()
-    facts = {
-        "player": player,
-        "scale": scale,
-        "env": to_dict(env),
-        "evaluation": to_dict(evaluation),
-        "tracking": to_dict(tracking),
-        "paths": to_dict(paths),
-    }
+    settings = _facts(env=env, evaluation=evaluation, tracking=tracking, paths=paths)
+    facts = {"player": player, "scale": scale, **settings}
     shown = labels(folder.name, run_colour("human"), "human")
     with _held(folder):
         progress.say(f"{player} plays {env.title}: {game.keys_in_words}")
@@ -168,6 +157,10 @@ def play(
         finally:
             window.close()
         _record(folder, facts, (played, evaluator.film(played, progress)), tracking, outputs, shown, command)
+
+
+def _facts(**parts: Any) -> dict[str, Any]:
+    return {name: to_dict(part) for name, part in parts.items()}
 
 
 @contextmanager
