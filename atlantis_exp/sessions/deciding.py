@@ -83,9 +83,9 @@ class Contest:
         for each in chosen:  # two may be written alike
             job, label = jobs[each], groups[each].label
             if label in self.contenders:
-                raise ConfigError(f"{' '.join(each)}: the same contender as {' '.join(self.contenders[label][0])}")
+                raise ConfigError(f"{' '.join(each)}: the same contender as {_said(self.contenders[label][0])}")
             if (twin := trained.setdefault(job.config.run_name(), each)) is not each:
-                raise ConfigError(f"{' '.join(each)}: trains what {' '.join(twin)} trains, under the same name")
+                raise ConfigError(f"{' '.join(each)}: trains what {_said(twin)} trains, under the same name")
             self.contenders[label] = (each, job)
         if mixed := mixed_protocol({groups[each].label: facts[each] for each in chosen}, by):
             raise ConfigError(f"{mixed[1]}; give that key itself several values, or train them under one protocol")
@@ -219,6 +219,10 @@ class Contest:
             ["train", "-m", *self.launcher, f"seed={','.join(map(str, seeds))}", *replaced(self._fixed, *overrides)]
             for seeds, overrides in parts
         ]
+
+
+def _said(overrides: Sequence[str]) -> str:
+    return " ".join(overrides) or "the config without it"
 
 
 def decide(contest: Contest, train: Callable[[Job], int | None] = train) -> None:

@@ -47,6 +47,11 @@ Command = Callable[..., int]
         (("model=cnn,resnet", "look=now"), "look=now: no such key"),
         (("model=cnn,resnet", "evaluation.at_end=false"), "evaluation.at_end=false: contenders are compared by the "),
         (("model=cnn,resnet", "hydra/launcher=joblb"), "In 'hydra/config': Could not find 'hydra/launcher/joblb'"),
+        (("model=cnn,resnet", "against=env.stack=2"), "model=cnn,resnet: several values, and against= as well; write"),
+        (("against=seed=3,model=cnn",), "seed: says how contenders are trained or measured, not what they are; one"),
+        (("against=model=cnn",), "model=cnn: the same contender as the config without it"),
+        (("against=model=rsenet",), "model=rsenet: no such option in conf/model; did you mean 'resnet'?"),
+        (("against=model",), "'model' is no override; write KEY=VALUE, as in model=resnet"),
         (("model=glob(*)",), "model=glob(*): no list of values; write them out"),
     ],
 )

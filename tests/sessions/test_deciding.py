@@ -10,21 +10,20 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import mlflow
 import pytest
 
 from atlantis_exp.commands.app import Asked
 from atlantis_exp.commands.compare import VERB as COMPARE
 from atlantis_exp.commands.compare import CompareConfig
+from atlantis_exp.commands.decide import VERB as DECIDE
 from atlantis_exp.commands.decide import DecideConfig, contest_of
-from atlantis_exp.commands.overrides import check, swept
+from atlantis_exp.commands.overrides import check
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import read_commit
+from atlantis_exp.runs.journal import NOTE, Tags, read_commit
 from atlantis_exp.sessions.deciding import Contest, decide, say_what_it_takes
-from atlantis_exp.sessions.job import replaced
-from atlantis_exp.tracking.publishing import catch_up
+from atlantis_exp.sessions.job import Job, replaced
 
 REPOSITORY = Path(__file__).parents[2]
 # Networks so young hold one action: seeds differ since each plays other games, with half of the decisions random.
@@ -45,8 +44,7 @@ def asking(tiny_overrides: tuple[str, ...], tmp_path: Path) -> Asking:
 
     def asked(*words: str) -> Contest:
         typed = tuple(replaced(tiny_overrides, f"paths.outputs={tmp_path}", *words))
-        several = swept(typed)
-        ((texts, config),) = check("decide", DecideConfig, [text for text in typed if text not in several]).items()
+        ((texts, config),) = check("decide", DecideConfig, DECIDE.rewrite([*typed])).items()
         return contest_of(Asked(config, "decide", texts, typed=typed))
 
     return asked
@@ -68,11 +66,6 @@ def deciding(tiny_overrides: tuple[str, ...], tmp_path: Path) -> Callable[..., s
         )
 
     return start
-
-
-def seeds_of(contest: Contest, label: str, most: int = 20) -> list[int]:
-    """The seeds of a contender whose runs have ended."""
-    return sorted({*range(most)} - {*contest.left(label, range(most))})
 
 
 def looks(outputs: Path) -> dict[str, list[dict[str, object]]]:
@@ -117,55 +110,116 @@ def test_contenders_are_trained_level_until_a_look_decides_and_compare_says_the_
     assert {name: (tmp_path / "runs" / name / "result.json").stat().st_mtime_ns for name in began} == began
 
 
-@pytest.mark.slow
-def test_decided_pairs_are_dropped_and_the_page_in_mlflow_has_each_look_once(
+def test_decided_pairs_are_dropped_and_each_look_is_on_the_page_once(
     asking: Asking, recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rates = {"lr=0.001": 9_000.0, "lr=0.002": 1_000.0, "lr=0.003": 1_000.0}
-    for label, score in rates.items():
-        # Of those that are alike, nine of the ten seeds of the last look are there.
-        record_seeds(recorded, score, range(5 if score > 5_000 else 9), f"optimizer.{label}")
-    contest = asking("optimizer.lr=0.001,0.002,0.003", "tracking=mlflow")
-    assert list(contest.contenders) == list(rates)
-    decide(contest)
+    rates = {0.001: 9_000.0, 0.002: 1_000.0, 0.003: 1_000.0}
+    contest = asking("optimizer.lr=0.001,0.002,0.003")
+    assert list(contest.contenders) == [f"lr={rate}" for rate in rates]
+    trained: list[tuple[float, int]] = []
+
+    def train(job: Job) -> None:
+        rate, seed = job.config.optimizer.lr, job.config.seed
+        trained.append((rate, seed))
+        record_seeds(recorded, rates[rate], range(seed, seed + 1), f"optimizer.lr={rate}")
+
+    decide(contest, train)
     printed = " ".join(capsys.readouterr().out.split())
-    assert [len(seeds_of(contest, label)) for label in rates] == [5, 10, 10]
+    first = [(rate, seed) for seed in range(5) for rate in rates]
+    assert trained == first + [(rate, seed) for seed in range(5, 10) for rate in (0.002, 0.003)]
     assert [look["error"] for look in looks(tmp_path)["optimizer.lr"]] == [0.0125, pytest.approx(0.0375)]
+    assert [len(look["seeds"]) for look in looks(tmp_path)["optimizer.lr"]] == [3, 2]  # type: ignore[arg-type]
     assert "lr=0.001 plays better than lr=0.002 by" in printed
     assert "Not decided: lr=0.002 against lr=0.003" in printed
+    assert "would have been found with 80 %" in printed
 
-    client = mlflow.MlflowClient(f"sqlite:///{tmp_path}/mlflow.db")
-    experiment = client.get_experiment_by_name("atlantis")
-    assert experiment is not None
-
-    catch_up(tmp_path)  # a busy machine may not have sent all of it in time
-    (run,) = client.search_runs([experiment.experiment_id], "tags.`atlantis.kind` = 'decision'")
-    assert run.info.status == "FINISHED"
-    assert run.data.tags["verdict"].startswith("lr=0.001 plays better than lr=0.002")
-    note = run.data.tags["mlflow.note.content"]
+    tags = [record.values for record in contest.folder.records() if isinstance(record, Tags)]
+    said = {key: value for values in tags for key, value in values.items()}
+    assert contest.folder.status == "FINISHED"
+    assert contest.folder.title == "decide optimizer.lr=0.001,0.002,0.003"
+    assert said["verdict"].startswith("lr=0.001 plays better than lr=0.002")
+    note = said[NOTE]
     for look in (
         *("5 | lr=0.001 over lr=0.002 | better", "5 | lr=0.001 over lr=0.003 | better"),
         *("5 | lr=0.002 over lr=0.003 | not decided", "10 | lr=0.002 over lr=0.003 | not decided"),
     ):
         assert note.count(f"| {look} |") == 1
-    assert contest.comparing in note
-    decide(contest)
-    catch_up(tmp_path)
-    assert client.get_run(run.info.run_id).data.tags["mlflow.note.content"] == note
+    assert re.search(r"\| 5 \| lr=0.001 over lr=0.002 \| better \| 8,000 \| [\d,]+ to [\d,]+ \| 1.25% \|", note)
+    assert f"`{contest.command}`" in note
+    assert f"`{contest.comparing}`" in note
 
 
-@pytest.mark.slow
-def test_seeds_that_are_there_are_looked_at_without_a_training(
-    asking: Asking, recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_what_stops_a_training_stops_its_decision_with_the_same_code(
+    asking: Asking, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for label, score in (("0.001", 9_000.0), ("0.002", 1_000.0), ("0.003", 1_000.0)):
-        record_seeds(recorded, score, range(5 if score > 5_000 else 10), f"optimizer.lr={label}")
-    before = set((tmp_path / "runs").iterdir())
-    contest = asking("optimizer.lr=0.001,0.002,0.003")
-    decide(contest)
-    assert [len(look["seeds"]) for look in looks(tmp_path)["optimizer.lr"]] == [3, 2]  # type: ignore[arg-type]
-    assert "would have been found with 80 %" in " ".join(capsys.readouterr().out.split())
-    assert set((tmp_path / "runs").iterdir()) == before
+    contest = asking("model=cnn,resnet", "seeds=5")
+    again = f"the decision goes on with: {contest.command}"
+    cases: list[tuple[BaseException | int | None, int, str, str]] = [
+        (SystemExit(143), 143, "KILLED", ""),
+        (KeyboardInterrupt(), 130, "KILLED", ""),
+        (signal.SIGTERM, 143, "KILLED", ""),  # it came too late to stop the training
+        (Fault("no disk", exit_code=7), 7, "FAILED", f"no disk; {again}"),
+        (Fault("late", exit_code=124), 124, "KILLED", f"late; {again}"),
+        (None, 1, "FAILED", f"run {contest.run('cnn', 0).name} has not ended; {again}"),
+    ]
+    for does, ended, status, reason in cases:
+
+        def train(_: Job, does: BaseException | int | None = does) -> int | None:
+            if isinstance(does, BaseException):
+                raise does
+            return does
+
+        with pytest.raises((Fault, SystemExit)) as stopped:
+            decide(contest, train)
+        assert getattr(stopped.value, "exit_code", getattr(stopped.value, "code", None)) == ended
+        assert (contest.folder.status, contest.folder.error) == (status, reason)
+        assert capsys.readouterr().err == ("" if reason else f"atlantis_exp: {again}\n")
+
+
+def test_a_launcher_is_given_one_sweep_where_all_need_the_same_seeds_else_one_each(
+    asking: Asking, recorded: Recorded
+) -> None:
+    contest = asking("model=cnn,resnet", "seeds=5")
+    contest.launcher = ("hydra/launcher=joblib",)
+    needed = contest.needed(None)
+    assert needed == {"cnn": [0, 1, 2, 3, 4], "resnet": [0, 1, 2, 3, 4]}
+    begin = ["train", "-m", "hydra/launcher=joblib"]
+    (sweep,) = contest.sweeps(needed)
+    assert [*sweep[:4], sweep[-1]] == [*begin, "seed=0,1,2,3,4", "model=cnn,resnet"]
+    assert "env.size=40" in sweep
+    assert not any(text.startswith("seeds=") for text in sweep)
+    record_seeds(recorded, 1_000, range(2), "model=cnn")
+    needed = contest.needed(None)
+    assert needed == {"cnn": [2, 3, 4], "resnet": [0, 1, 2, 3, 4]}
+    sweeps = contest.sweeps(needed)
+    assert [(sweep[3], sweep[-1]) for sweep in sweeps] == [
+        *(("seed=2,3,4", "model=cnn"), ("seed=0,1,2,3,4", "model=resnet"))
+    ]
+    record_seeds(recorded, 1_000, range(2, 5), "model=cnn")
+    (sweep,) = contest.sweeps(contest.needed(None))
+    assert (sweep[3], sweep[-1]) == ("seed=0,1,2,3,4", "model=resnet")
+
+
+def test_a_sweep_of_a_launcher_that_fails_ends_the_decision_with_its_code(asking: Asking) -> None:
+    contest = asking("model=cnn,resnet", "seeds=5")
+    contest.launcher = ("hydra/launcher=nobody",)
+    with pytest.raises(Fault, match=r"^a sweep ended with exit code 2; the decision goes on with: ") as failed:
+        decide(contest)
+    assert failed.value.exit_code == 2
+
+
+def test_several_keys_at_once_are_two_contenders(asking: Asking) -> None:
+    contest = asking("against=optimizer=rmsprop,optimizer.lr=0.002", "optimizer=adam", "seeds=5")
+    assert list(contest.contenders) == ["lr=0.001 adam", "lr=0.002 rmsprop"]
+    (_, one), (_, other) = contest.contenders.values()
+    assert (one.config.optimizer.name, one.config.optimizer.lr) == ("adam", 0.001)
+    assert (other.config.optimizer.name, other.config.optimizer.lr) == ("rmsprop", 0.002)
+    assert [family.name for family in contest.families] == ["optimizer.lr,optimizer"]
+    contest.launcher = ("hydra/launcher=joblib",)
+    one_sweep, other_sweep = contest.sweeps(contest.needed(None))
+    assert "optimizer=adam" in one_sweep
+    assert other_sweep[-2:] == ["optimizer=rmsprop", "optimizer.lr=0.002"]
+    assert "optimizer=adam" not in other_sweep
 
 
 @pytest.mark.slow
@@ -184,9 +238,9 @@ def test_a_run_that_was_trained_longer_than_is_asked_is_no_seed_of_the_question(
     asking: Asking, recorded: Recorded
 ) -> None:
     record_seeds(recorded, 1_000, range(5), "model=cnn")
-    longer = recorded("model=resnet", "seed=3", "budget.steps=900", outcome="budget", steps=900)
+    longer = recorded("model=resnet", "seed=3", "budget.steps=161", outcome="budget", steps=161)
     line = (
-        f"^budget.steps=160: run {longer.name} was trained for 900 steps; ask for as many, or for other paths.outputs$"
+        f"^budget.steps=160: run {longer.name} was trained for 161 steps; ask for as many, or for other paths.outputs$"
     )
     with pytest.raises(ConfigError, match=line):
         asking("model=cnn,resnet", "budget.steps=160")
@@ -219,19 +273,13 @@ def test_the_command_that_compares_is_read_as_it_is_meant(asking: Asking, tmp_pa
     assert config.paths.outputs == str(tmp_path)
 
 
-@pytest.mark.slow
 def test_the_same_question_is_the_same_decision_however_it_is_written(asking: Asking) -> None:
     one = asking("optimizer.lr=0.001,0.002", "budget.steps=1_000_000")
-    for line in (
-        "optimizer.lr=0.002,1e-3 budget.steps=1000000",
-        "optimizer.lr=0.001,0.002 budget.steps=1_000_000 threads=2 tracking=mlflow",
-    ):
-        assert asking(*line.split()).folder == one.folder
-    several = ("model=cnn,resnet", "optimizer.lr=0.001,0.002")
-    assert asking(*several).folder == asking(*reversed(several)).folder
-    assert asking(*several).comparing == asking(*reversed(several)).comparing
-    for line in ("budget.steps=2_000_000", "budget.steps=1_000_000 seeds=20", "budget.steps=1_000_000 delta=5%"):
-        assert asking("optimizer.lr=0.001,0.002", *line.split()).folder != one.folder
+    again = asking("optimizer.lr=0.002,1e-3", "budget.steps=1000000", "threads=2", "tracking=mlflow")
+    assert again.folder == one.folder
+    assert again.folder.path.parent.name == "decisions"
+    for words in (("budget.steps=2_000_000",), ("budget.steps=1_000_000", "delta=5%")):
+        assert asking("optimizer.lr=0.001,0.002", *words).folder != one.folder
 
 
 def said(contest: Contest, capsys: pytest.CaptureFixture[str]) -> str:

@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import os
 import signal
 import sqlite3
 import subprocess
@@ -254,18 +253,17 @@ def test_a_job_that_fails_is_shown_as_failed_with_its_error_and_so_is_its_sweep(
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_sweep_that_a_signal_ends_is_closed(pair: list[Job], number: int) -> None:
+def test_a_sweep_that_a_signal_ends_is_closed(tiny: Compose, tmp_path: Path, number: int) -> None:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background job lacks
 
     def sweep() -> None:
-        with ledger(pair, ["seed=0,1"]):
-            os.kill(os.getpid(), number)
-            signal.pause()
+        with ledger([Job(tiny())], [], ELSEWHERE):
+            signal.raise_signal(number)
 
     with pytest.raises((SystemExit, KeyboardInterrupt)):
         sweep()
     signal.signal(signal.SIGINT, before)
-    assert page_of(pair[0].outputs).status == "KILLED"
+    assert page_of(tmp_path).status == "KILLED"
 
 
 def test_a_larger_sweep_takes_the_runs_of_a_smaller_one_over(pair: list[Job], tiny: Compose) -> None:
