@@ -76,8 +76,8 @@ def make_emulator(env: cfg.EnvConfig) -> partial[Emulator]:
 
 
 def build_emulators(env: cfg.EnvConfig, cores: int, num_envs: int) -> Emulators:
-    """Return `num_envs` emulators: one in this process, more in worker processes, one a core unless the config says."""
-    return make_emulators(make_emulator(env), num_envs, env.workers or max(1, cores))
+    """Return emulators: a single one in this process, several in worker processes, as many as cores unless set."""
+    return make_emulators(make_emulator(env), num_envs, env.workers or cores)
 
 
 def choose_device(name: str) -> torch.device:
@@ -318,9 +318,11 @@ def build_baseline(agent: cfg.BaselineAgentConfig, env: cfg.EnvConfig) -> Actor:
 
 def build_evaluator(env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig, cores: int) -> Evaluator:
     """Return what evaluates any actor by this protocol."""
+    make = make_emulator(env)
+    workers = env.workers or max(1, cores - 1)  # one core is for the network, which decides meanwhile
     return Evaluator(
-        make_emulators=partial(build_emulators, env, cores - 1),  # one is for the network, which decides meanwhile
-        make_emulator=make_emulator(env),
+        make_emulators=lambda num_envs: make_emulators(make, num_envs, workers),
+        make_emulator=make,
         epsilon=evaluation.epsilon,
         seed=evaluation.seed,
         num_envs=evaluation.at_once,
@@ -361,14 +363,17 @@ def build_trainer(
     """Return all of a run; it writes under `folder` only. `about` opens its description, in markdown."""
     env = config.env
     plan, learner, memory = build_plan(config), build_learner(config), build_memory(config)
-    num_actions = _num_actions(config)
-    watched = EpsilonGreedy(learner.evaluated_q_values, num_actions, watches=True)
-    evaluator = build_evaluator(env, config.evaluation, cores)
+    evaluator, cadence = (
+        build_evaluator(env, config.evaluation, cores),
+        build_cadence(config.evaluation, config.tracking),
+    )
+    game = facts_of(config.game)
+    watched = EpsilonGreedy(learner.evaluated_q_values, len(game.actions), watches=True)
     return Trainer(
         plan=plan,
-        emulators=build_emulators(env, cores, env.num_envs),
+        emulators=make_emulators(evaluator.make_emulator, env.num_envs, env.workers or cores),
         stack=FrameStack(env.num_envs, env.size, env.stack),
-        actor=EpsilonGreedy(learner.q_values, num_actions),
+        actor=EpsilonGreedy(learner.q_values, len(game.actions)),
         memory=memory,
         learner=learner,
         exploration=[np.random.default_rng(child) for child in stream(config.seed, "exploration").spawn(env.num_envs)],
@@ -376,14 +381,14 @@ def build_trainer(
         seeds=stream(config.seed, "emulators").generate_state(env.num_envs).tolist(),
         recorder=Recorder(
             plan=plan,
-            cadence=build_cadence(config.evaluation, config.tracking),
+            cadence=cadence,
             learner=learner,
             memory=memory,
             tracker=tracker,
             progress=progress,
             evaluate=partial(evaluator, watched),
             film=evaluator.film,
-            score_range=facts_of(config.game).score_range,
+            score_range=game.score_range,
             about=about,
         ),
         checkpoints=Checkpoints(folder / CHECKPOINTS, config.identity()),
