@@ -90,9 +90,16 @@ def _defaults(path: Path) -> list[str]:
 
 def _keys(path: Path, prefix: str) -> Iterator[str]:
     """Yield a line for each key of a file: dotted key, value, sentence; those of the files that it is made of first."""
+    own = [*_own_keys(path, prefix)]
+    names = {match[1] for line in own if (match := _SHOWN.match(line))}
     for line in _defaults(path):
         if (base := path.parent / f"{line.strip(' -')}.yaml").is_file() and base.stem != "hydra_defaults":
-            yield from _keys(base, prefix)
+            yield from _without(names, _keys(base, prefix))
+    yield from own
+
+
+def _own_keys(path: Path, prefix: str) -> Iterator[str]:
+    """Yield a line for each key that stands in a file itself, as `_keys`."""
     parents: list[str] = []
     in_defaults = False
     for line in path.read_text("utf-8").splitlines():
