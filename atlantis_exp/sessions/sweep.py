@@ -1,4 +1,4 @@
-"""A sweep as a run of its own that its trainings are shown under, with their table and figures on its page."""
+"""A sweep as a run of its own that its trainings are shown under, with their table on its page."""
 
 import csv
 import io
@@ -13,9 +13,8 @@ from typing import Any, get_args
 from atlantis_exp import terminal
 from atlantis_exp.checking import digest
 from atlantis_exp.faults import Fault
-from atlantis_exp.media import curves, strips
 from atlantis_exp.runs.folder import TABLE_COLUMNS, TRACEBACK, RunFolder, State
-from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, adopt, curve
+from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, adopt
 from atlantis_exp.sessions.job import Job, fitted
 from atlantis_exp.sessions.launchers import BASIC, Launcher, joblib, slurm
 from atlantis_exp.sessions.live import LiveTable
@@ -106,7 +105,7 @@ def _page(runs: Runs, swept: Sequence[str], launcher: Launcher, command: str) ->
             with _every(_PAGE_SECONDS, describe) as close_page, _launched(launcher, journal, runs, close_page):
                 yield
         finally:
-            _draw(journal, runs)
+            _tabulate(journal, runs)
             describe()
 
 
@@ -176,36 +175,20 @@ def _describe(journal: Journal, runs: Runs) -> None:
         if folder.state == "failed":
             told = f" (`{TRACEBACK}` of the run tells all)" if (folder.path / TRACEBACK).exists() else ""
             failures.append(f"- **{job.title} failed**: {folder.error}{told}")
-    parts = [fitted(failures, NOTE_LENGTH // 4, "`runs.csv`"), "Figures: `curves.png`, `scores.png`."]
-    above = "\n\n".join(part for part in parts if part)
-    journal.note(f"{above}\n\n{fitted(lines, NOTE_LENGTH - len(above), '`runs.csv`')}")
+    above = fitted(failures, NOTE_LENGTH // 4, "`runs.csv`") + "\n\n"
+    journal.note(f"{above}{fitted(lines, NOTE_LENGTH - len(above), '`runs.csv`')}".strip())
     journal.flush()
 
 
-def _draw(journal: Journal, runs: Runs) -> None:
-    """Write the sweep's figures and its table of numbers."""
-    trained: dict[str, tuple[str, list[list[tuple[float, float]]]]] = {}
-    evaluated: dict[str, tuple[str, list[float]]] = {}
+def _tabulate(journal: Journal, runs: Runs) -> None:
+    """Write all numbers of the sweep's runs."""
     rows: list[dict[str, Any]] = []
     for folder, job in runs.items():
-        trained.setdefault(job.group, (job.colour, []))[1].append(_curve(folder, "score/mean_100"))
-        numbers: dict[str, float] = {}
-        if (result := folder.result) is not None:
-            numbers = {"steps": result.steps, **result.counts, **result.evaluation}
-            if result.evaluation:
-                evaluated.setdefault(job.group, (job.colour, []))[1].append(result.evaluation["evaluation/mean"])
+        result = folder.result
+        numbers = {"steps": result.steps, **result.counts, **result.evaluation} if result else {}
         rows.append({"run": folder.name, "title": job.title, "state": folder.state, **numbers})
-    journal.artifact("curves.png", curves(trained, "step", "score, mean of 100 episodes"))
-    if evaluated:
-        journal.artifact("scores.png", strips(evaluated, "mean score of the last evaluation, a dot a run"))
     text = io.StringIO()
     writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     journal.artifact("runs.csv", text.getvalue().encode())
-
-
-def _curve(folder: RunFolder, key: str) -> list[tuple[float, float]]:
-    with suppress(ValueError, OSError):  # of a journal that was damaged: the run's own command says so
-        return [(record.step, record.values[key]) for record in curve(folder.path, [key])]
-    return []
