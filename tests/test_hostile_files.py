@@ -419,6 +419,7 @@ FORGERIES: dict[str, Callable[[State, ReplayMemory], object]] = {
     "priorities that are not numbers": lambda state, _: state["samplers"]["0"]["priorities"].fill(np.nan),
     "priorities of another memory": lambda state, _: state["samplers"]["0"].update(priorities=np.ones(7)),
     "priorities of what is to come": lambda state, _: state["samplers"]["0"].update(next_id=2**40),
+    "priorities from before the beginning": lambda state, _: state["samplers"]["0"].update(oldest_id=-(2**63)),
     "a highest priority of nothing": lambda state, _: state["samplers"]["0"].update(highest=0.0),
     "a stack of another size": lambda state, _: state["stack"].update(state=state["stack"]["state"][..., 1:]),
     "a stack of another type": lambda state, _: state["stack"].update(state=state["stack"]["state"].astype(float)),
