@@ -46,7 +46,10 @@ Command = Callable[..., int]
         (("model=cnn,resnet", "error=0"), "error=0: should be greater than 0"),
         (("model=cnn,resnet", "look=now"), "look=now: no such key"),
         (("model=cnn,resnet", "evaluation.at_end=false"), "evaluation.at_end=false: contenders are compared by the "),
-        (("model=cnn,resnet", "hydra/launcher=joblb"), "In 'hydra/config': Could not find 'hydra/launcher/joblb'"),
+        (
+            ("model=cnn,resnet", "hydra/launcher=joblb"),
+            "hydra/launcher=joblb: no such launcher; did you mean 'joblib'?",
+        ),
         (("model=glob(*)",), "model=glob(*): no list of values; write them out"),
     ],
 )
