@@ -16,13 +16,18 @@ class Machine:
     slurm_restarts: int | None = None  # of this job; None outside of Slurm
 
 
+def all_cores() -> int:
+    """Return how many cores this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1  # macOS has none
+
+
 def here() -> Machine:
     """Read this process's environment.
 
-    Its cores are those that it may run on, and of these its share in OMP_NUM_THREADS, where launchers and Slurm's
-    scripts say it and where torch looks for its threads.
+    Its cores are its share of all in OMP_NUM_THREADS, where launchers and Slurm's scripts say it and where torch looks
+    for its threads.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1  # macOS has none
+    cores = all_cores()
     share, restarts = os.environ.get("OMP_NUM_THREADS", ""), os.environ.get("SLURM_RESTART_COUNT", "0")
     return Machine(
         cores=min(cores, int(share)) if share.isdecimal() and int(share) else cores,

@@ -10,7 +10,7 @@ import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -225,13 +225,10 @@ def prepared(name: str, *words: str) -> Callable[[], object]:
     verb: Verb[Any] = importlib.import_module(f"atlantis_exp.commands.{name}").VERB
     jobs = check(verb.config_name or name, verb.schema, verb.rewrite(list(words)))
     asked = [Asked(config, name, overrides, typed=words) for overrides, config in jobs.items()]
-    works = [verb.work(each) for each in asked]
-
-    def work() -> None:
-        with verb.sweep(asked, BASIC, words) if len(asked) > 1 else nullcontext():
-            for each in works:
-                each()
-
+    if len(asked) > 1 and verb.sweep is not None:
+        sweep = verb.sweep
+        return lambda: sweep(asked, BASIC, words)
+    work: Callable[[], object] = verb.work(asked[0])
     return work
 
 

@@ -26,9 +26,8 @@ def overview() -> str:
     """Return the first screen: the verbs, those of every day first."""
     lines = [f"  {name:15}{purpose}" for name, purpose in VERBS.items()]
     lines.insert(DAILY, "\nmore:")
-    return "\n".join(
-        [f"{PROGRAM} [VERB] KEY=VALUE ...", "", *lines, "", "No verb means train. VERB --help lists its keys."]
-    )
+    parts = [f"{PROGRAM} [VERB] KEY=VALUE ...", "\n".join(lines), *_plugins()]
+    return "\n\n".join([*parts, "No verb means train. VERB --help lists its keys."])
 
 
 def help_text(verb: str, arguments: Sequence[str]) -> str:
@@ -78,7 +77,7 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
     for line in _defaults(path):
         if match := _GROUP.fullmatch(line):
             yield match["group"], match["option"]
-        elif (other := path.parent / f"{line.strip(' -')}.yaml").is_file() and other.stem != "hydra_defaults":
+        elif (other := path.parent / f"{line.strip(' -')}.yaml").is_file():
             yield from _groups(other)
 
 
@@ -93,7 +92,7 @@ def _keys(path: Path, prefix: str) -> Iterator[str]:
     own = [*_own_keys(path, prefix)]
     names = {match[1] for line in own if (match := _SHOWN.match(line))}
     for line in _defaults(path):
-        if (base := path.parent / f"{line.strip(' -')}.yaml").is_file() and base.stem != "hydra_defaults":
+        if (base := path.parent / f"{line.strip(' -')}.yaml").is_file():
             yield from _without(names, _keys(base, prefix))
     yield from own
 

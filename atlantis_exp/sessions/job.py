@@ -19,8 +19,12 @@ class Job:
     config: Config
     words: tuple[str, ...] = ()  # what was asked for besides network, sampler and seed, in few words
     overrides: tuple[str, ...] = ()  # as typed, of this job alone
-    launcher: str | None = None  # of the sweep that this process does one job of, `apart` in a process of its own
     machine: Machine = field(default_factory=here)
+
+    @property
+    def launcher(self) -> str | None:
+        """The launcher of the sweep that this process does one job of."""
+        return self.machine.launcher
 
     @property
     def command(self) -> str:

@@ -67,7 +67,6 @@ class StopRequest:
         """Listen while the block runs."""
         signals = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
         self._before = {number: signal.signal(number, self._receive) for number in signals}
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)  # as inherited from a launcher's worker
         try:
             yield
         finally:
@@ -86,7 +85,7 @@ class StopRequest:
 
 def sweep_goes_on(folder: RunFolder, launcher: str | None) -> Callable[[], bool]:
     """Return a call that tells whether the process that launched this job still wants it; Slurm's jobs outlive it."""
-    if folder.parent is None or launcher not in ("joblib", "apart"):
+    if folder.parent is None or launcher != "joblib":
         return lambda: True
     sweep = RunFolder(folder.parent)
     return lambda: sweep.status == "RUNNING" and sweep.is_held

@@ -118,7 +118,7 @@ def _launched(launcher: Launcher, journal: Journal, runs: Runs, close_page: Call
     folders, jobs = list(runs), list(runs.values())
     match launcher.name:
         case "joblib":
-            context: AbstractContextManager[None] = joblib.jobs(journal, jobs, close_page, launcher)
+            context: AbstractContextManager[None] = joblib.committed_at_the_end(journal, folders, close_page)
         case "slurm":
             context = slurm.all_awaited()
         case _:

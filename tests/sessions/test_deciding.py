@@ -353,7 +353,6 @@ def test_a_decision_that_was_killed_goes_on_and_ends_as_the_unbroken_one(
 def test_a_launcher_trains_what_the_decision_needs_with_a_sampler_from_a_file(
     deciding: Callable[..., subprocess.Popen[str]], tmp_path: Path
 ) -> None:
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the extra joblib is not installed")
     launcher = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
     process = deciding(CAPS, "plugins=examples/paying.py", "sampler=paying", *launcher, "tracking=mlflow")
     out, error = process.communicate()
@@ -369,7 +368,6 @@ def test_a_launcher_trains_what_the_decision_needs_with_a_sampler_from_a_file(
 def test_the_end_of_a_decision_has_its_launchers_jobs_commit(
     deciding: Callable[..., subprocess.Popen[str]], tmp_path: Path
 ) -> None:
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the extra joblib is not installed")
     process = deciding(
         *(CAPS, "phase.quick.steps=100_000", "tracking.commit_seconds=0.5"),
         *("hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),

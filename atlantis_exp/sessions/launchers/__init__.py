@@ -1,13 +1,14 @@
-"""The launchers that run a sweep's jobs in other processes: joblib on this machine, Slurm on a cluster."""
+"""The launchers that run a sweep's trainings in other processes: joblib on this machine, Slurm on a cluster."""
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 
 class Launcher(NamedTuple):
-    """An option of `hydra/launcher`; Hydra's own runs the jobs one after the other in the sweep's process."""
+    """An option of `hydra/launcher` with its settings; the basic one runs jobs in turn in the sweep's process."""
 
     name: str = "basic"
-    n_jobs: int | None = None  # at a time, as joblib counts them
+    settings: Mapping[str, Any] = {}
 
     @property
     def is_basic(self) -> bool:
