@@ -17,7 +17,7 @@ from atlantis_exp.learning.learner import Learner
 from atlantis_exp.media import score_heatmap, score_histogram
 from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.replay.memory import ReplayMemory
-from atlantis_exp.runs.files import schema_of
+from atlantis_exp.runs.files import checked
 from atlantis_exp.runs.folder import BEST_EPISODE, EPISODES, EVALUATED, NETWORK, evaluation_at
 from atlantis_exp.runs.journal import Tracker
 from atlantis_exp.training.checkpoint import to_safetensors
@@ -244,7 +244,7 @@ class Recorder:
             self.episodes.append(Played(int(episode), int(step), int(frames), score, int(length), int(env)))
         if not np.isfinite(self.recent_scores(len(self.episodes))).all():
             raise ValueError("the scores are not finite")
-        saved = schema_of(_Saved).validate_python(state)
+        saved = checked(_Saved, state)
         self.best_mean = -np.inf if saved.best_mean is None else saved.best_mean
         self.evaluations, self.evaluated_at = saved.evaluations, saved.evaluated_at
         self.evaluation_pending, self.best_step = saved.owes_evaluation, saved.best_step
