@@ -294,7 +294,7 @@ def test_without_a_terminal_a_line_now_and_then_says_how_far_a_training_is(monke
         "episode 1  first episode  epsilon 0.46  step 1,000  "
         "updates 2,000  33 steps/s  phase first  10.0%  left 0:04:30",
         "episode 23  score 12,345  mean of 20 1,662  duration 1,210 (mean of 100 1,105)  epsilon 0.46  step 2,000  "
-        "updates 4,000  33 steps/s  phase first  20.0%  left 0:04:00",
+        "updates 4,000  33 steps/s  phase first  20.0%  left 0:03:59",
         "episode 23  score 12,345  mean of 20 1,662  duration 1,210 (mean of 100 1,105)  epsilon 0.46  step 3,000  "
         "updates 6,000  33 steps/s  phase first  85.7%  left 0:00:14",
     ]
