@@ -13,7 +13,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, fields
 from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import Distribution, PackageNotFoundError, distribution, entry_points
@@ -48,19 +48,19 @@ Rescaling = Literal["signed_sqrt", "symlog"]
 
 
 @dataclass(frozen=True)
-class _Facts:
-    """The class attributes that a kind reads, with their defaults."""
+class _NoFacts:
+    pass
 
 
 @dataclass(frozen=True)
-class _NetworkFacts(_Facts):
+class _NetworkFacts:
     input_size: int = 84  # pixels a side that it is made for
     smallest_side: int = 1  # pixels
     splits_batches: bool = False  # whether the output for a sample depends on that sample alone
 
 
 @dataclass(frozen=True)
-class _ObjectiveFacts(_Facts):
+class _ObjectiveFacts:
     head: Literal["plain", "quantile"] = "plain"  # of the network; plain includes dueling
 
 
@@ -69,24 +69,19 @@ class Kind:
     """A kind of component: the contract of its classes."""
 
     given: int = 0  # arguments of the constructor ahead of the settings
-    facts: type = _Facts
-    methods: Mapping[str, str] = field(default_factory=dict)  # their arguments by name
+    facts: type = _NoFacts  # class attributes, with their defaults
+    methods: tuple[str, ...] = ()  # with their arguments
 
 
-_SCHEDULE: Final = Kind(methods={"__call__": "progress, steps"})
+_SCHEDULE: Final = Kind(methods=("__call__(progress, steps)",))
 KINDS: Final = {
-    "model": Kind(given=3, facts=_NetworkFacts, methods={"forward": "x"}),  # input_shape, num_actions, head
+    "model": Kind(given=3, facts=_NetworkFacts, methods=("forward(x)",)),  # input_shape, num_actions, head
     "sampler": Kind(
-        methods={
-            "sample": "memory, batch_size, rng",
-            "feed_back": "ids, errors",
-            "state_dict": "",
-            "load_state_dict": "state",
-        }
+        methods=("sample(memory, batch_size, rng)", "feed_back(ids, errors)", "state_dict()", "load_state_dict(state)")
     ),
     "objective": Kind(
         facts=_ObjectiveFacts,
-        methods={"targets": "r_t, s_tpm, discount, online, target", "losses": "q, a_t, target"},
+        methods=("targets(r_t, s_tpm, discount, online, target)", "losses(q, a_t, target)"),
     ),
     "epsilon": _SCHEDULE,
     "lr_schedule": _SCHEDULE,
@@ -275,13 +270,13 @@ def _check(kind: str, cls: type[Any], settings: Sequence[Setting], facts: Mappin
             TypeAdapter(told).validate_python(value, strict=True)
         except ValidationError:
             raise TypeError(f"{name}: should be a {inspect.formatannotation(told)}, not {value!r}") from None
-    for method, arguments in KINDS[kind].methods.items():
-        names = ["self", *filter(None, arguments.split(", "))]
+    for signature in KINDS[kind].methods:
+        method, *arguments = re.findall(r"\w+", signature)
         found = next((vars(each)[method] for each in cls.__mro__ if method in vars(each)), None)
         try:
-            inspect.signature(found).bind(*names)  # type: ignore[arg-type]
+            inspect.signature(found).bind("self", *arguments)  # type: ignore[arg-type]
         except TypeError:
-            raise TypeError(f"needs a method {method}({', '.join(names)})") from None
+            raise TypeError(f"needs a method {method}({', '.join(['self', *arguments])})") from None
     quantiles = {each.name: each.type for each in settings}.get("quantiles")
     if facts.get("head") == "quantile" and getattr(quantiles, "__origin__", quantiles) is not int:
         raise TypeError('head = "quantile" needs a setting quantiles: int, their number')

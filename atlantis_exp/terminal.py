@@ -38,7 +38,7 @@ def warn(text: str) -> None:
 
 def until_line(lines: int) -> float:
     """Return the seconds before the next line of what is under way, after so many: 4, 8, 16, then 30 each."""
-    return min(LINE_SECONDS * 2 ** min(lines, 3), 30.0)
+    return min(LINE_SECONDS * 2.0 ** min(lines, 3), 30.0)
 
 
 @contextmanager

@@ -5,11 +5,12 @@ import io
 import json
 import logging
 import os
+import random
 import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -224,13 +225,10 @@ def prepared(name: str, *words: str) -> Callable[[], object]:
     verb: Verb[Any] = importlib.import_module(f"atlantis_exp.commands.{name}").VERB
     jobs = check(verb.config_name or name, verb.schema, verb.rewrite(list(words)))
     asked = [Asked(config, name, overrides, typed=words) for overrides, config in jobs.items()]
-    works = [verb.work(each) for each in asked]
-
-    def work() -> None:
-        with verb.sweep(asked, BASIC, words) if len(asked) > 1 else nullcontext():
-            for each in works:
-                each()
-
+    if len(asked) > 1 and verb.sweep is not None:
+        sweep = verb.sweep
+        return lambda: sweep(asked, BASIC, words)
+    work: Callable[[], object] = verb.work(asked[0])
     return work
 
 
@@ -418,6 +416,7 @@ FORGERIES: dict[str, Callable[[State, ReplayMemory], object]] = {
     "priorities that are not numbers": lambda state, _: state["samplers"]["0"]["priorities"].fill(np.nan),
     "priorities of another memory": lambda state, _: state["samplers"]["0"].update(priorities=np.ones(7)),
     "priorities of what is to come": lambda state, _: state["samplers"]["0"].update(next_id=2**40),
+    "priorities from before the beginning": lambda state, _: state["samplers"]["0"].update(oldest_id=-(2**63)),
     "a highest priority of nothing": lambda state, _: state["samplers"]["0"].update(highest=0.0),
     "a stack of another size": lambda state, _: state["stack"].update(state=state["stack"]["state"][..., 1:]),
     "a stack of another type": lambda state, _: state["stack"].update(state=state["stack"]["state"].astype(float)),
@@ -476,3 +475,48 @@ def test_what_training_refuses_as_forged_is_not_played_either(forged: Forged) ->
 def test_what_is_not_changed_goes_on(forged: Forged) -> None:
     train(Job(config := forged(lambda *_: None)))
     assert RunFolder.of(config).state == "done"
+
+
+def anywhere(seed: int) -> Callable[[State, ReplayMemory], None]:
+    """A forgery of any leaf of a state: a number or a text of a form that hurts, an array cut, retyped or filled."""
+
+    def change(state: State, _: ReplayMemory) -> None:
+        rng = random.Random(seed)
+        leaves: list[tuple[Any, Any]] = []
+
+        def walk(node: State) -> None:
+            for key, value in node.items():
+                if isinstance(value, dict) and value:
+                    walk(value)
+                else:
+                    leaves.append((node, key))
+
+        walk(state)
+        node, key = rng.choice(leaves)
+        if not isinstance(value := node[key], np.ndarray | torch.Tensor):
+            node[key] = rng.choice((*NUMBERS, *TEXTS, None, [], {}, True))
+            return
+        array = np.asarray(value).copy()
+        match rng.choice(("cut", "retype", "fill")):
+            case "cut":
+                array = array.reshape(-1)[1:]
+            case "retype":
+                array = array.astype(rng.choice((np.float32, np.int64, np.uint8, np.bool_)))
+            case _ if array.dtype.kind == "f":
+                array.fill(rng.choice((np.nan, np.inf, -1e30, 1e30, 0)))
+            case _:
+                array.fill(rng.choice((0, 1, 255 if array.dtype == np.uint8 else 2**40)))
+        node[key] = torch.from_numpy(array) if isinstance(value, torch.Tensor) else array
+
+    return change
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(200))
+def test_a_checkpoint_forged_anywhere_goes_on_or_is_one_line(
+    seed: int, forged: Forged, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = forged(anywhere(seed))
+    with soon(), suppress(Fault):
+        train(Job(config))
+    assert "Warning" not in capsys.readouterr().err

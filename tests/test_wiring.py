@@ -25,7 +25,7 @@ from atlantis_exp.components import known
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.replay.memory import Returns
-from atlantis_exp.runs.journal import NullJournal
+from atlantis_exp.runs.journal import Tracker
 from atlantis_exp.sessions.job import replaced
 from atlantis_exp.training.actor import ConstantActor, RandomActor
 from atlantis_exp.training.plan import Cadence, Counters
@@ -271,7 +271,7 @@ def test_without_a_terminal_a_line_now_and_then_says_how_far_a_training_is(monke
         cadence=unused,
         learner=cast(Any, learner),
         memory=unused,
-        tracker=NullJournal(),
+        tracker=Tracker(),
         progress=Progress(Console(file=text, width=80, soft_wrap=True)),
         evaluate=unused,
         film=unused,
@@ -280,7 +280,7 @@ def test_without_a_terminal_a_line_now_and_then_says_how_far_a_training_is(monke
     recorder.begin(counters, None)
     recorder._pace = Pace(lambda: now)
     for look in range(7):
-        now = 100 + (5 * look if look % 2 == 0 else 5 * look - 4)  # too early for a line at every second look
+        now = 100 + (15 * look if look % 2 == 0 else 15 * look - 14)  # too early for a line at every second look
         counters.steps, learner.updates = 500 * look, 1_000 * look
         if look == 3:
             scores = (*np.linspace(0, 2_000, 21).tolist(), 12_345.0)
@@ -292,9 +292,9 @@ def test_without_a_terminal_a_line_now_and_then_says_how_far_a_training_is(monke
         recorder.show(counters)
     assert text.getvalue().splitlines() == [
         "episode 1  first episode  epsilon 0.46  step 1,000  "
-        "updates 2,000  100 steps/s  phase first  10.0%  left 0:01:30",
+        "updates 2,000  33 steps/s  phase first  10.0%  left 0:04:30",
         "episode 23  score 12,345  mean of 20 1,662  duration 1,210 (mean of 100 1,105)  epsilon 0.46  step 2,000  "
-        "updates 4,000  100 steps/s  phase first  20.0%  left 0:01:20",
+        "updates 4,000  33 steps/s  phase first  20.0%  left 0:03:59",
         "episode 23  score 12,345  mean of 20 1,662  duration 1,210 (mean of 100 1,105)  epsilon 0.46  step 3,000  "
-        "updates 6,000  100 steps/s  phase first  85.7%  left 0:00:05",
+        "updates 6,000  33 steps/s  phase first  85.7%  left 0:00:14",
     ]

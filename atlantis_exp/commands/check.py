@@ -29,7 +29,7 @@ def _work(asked: Asked[Config]) -> Callable[[], None]:
     kinds = [text.partition("=")[0] for text in chosen] or [*KINDS]
     measured = {}
     if references := [text for text in _OURS if text.partition("=")[0] in kinds]:
-        measured[" ".join(chosen) or f"model={job.config.model.name}"] = job
+        measured["\n".join(chosen) or f"model={job.config.model.name}"] = job
         for text in references:
             kind = text.partition("=")[0]
             own = [each for each in asked.overrides if not each.startswith(kind)]

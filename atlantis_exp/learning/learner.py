@@ -1,7 +1,7 @@
 """The learner: two networks, an optimizer, and the update that moves them."""
 
 import copy
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, Literal
@@ -107,27 +107,30 @@ class Learner(ActionValues):
         if weights is None:
             weights = np.ones(len(a_t), np.float32)
         shards = self._shards(s_t, a_t, r_t, s_tpm, discount, weights)
-        parts = self._each(shards)(partial(self._gradients, len(a_t)), *shards)
+        parts = self._map_shards(partial(self._gradients, len(a_t)), shards)
         gradients, means, errors = zip(*parts, strict=True)
-        total, *others = gradients
-        for other in others:
-            torch._foreach_add_(total, other)
-        for parameter, gradient in zip(_learned(self.network), total, strict=True):
+        for parameter, gradient in zip(_learned(self.network), _summed(gradients), strict=True):
             parameter.grad = gradient
         self._measure(torch.stack(means).sum(0))
         self.optimizer.step()
-        self._online.refresh()
         self.updates += 1
+        self._online.refresh()
+        self._move_target()
+        self._move_average()
+        return torch.cat(errors)
+
+    def _move_target(self) -> None:
         if self.updates % self.target_every == 0:
             _follow(self.target, self.network, self.tau, buffers=self.target_mode == "eval")
             self._target.refresh()
+
+    def _move_average(self) -> None:
         if self.ema and self.updates % _AVERAGE_EVERY == 0:
             # From random weights, a plain mean of all so far, until there are as many as are asked for.
             first = 0.0 if self._has_begun_with else _AVERAGE_EVERY / self.updates
             share = max(first, _AVERAGE_EVERY / self.ema)
             _follow(self.evaluated, self.network, share, buffers=True)
             self._evaluated.refresh()
-        return torch.cat(errors)
 
     def _gradients(
         self,
@@ -309,8 +312,16 @@ class Learner(ActionValues):
         }
 
 
+def _summed(gradients: Sequence[list[torch.Tensor]]) -> list[torch.Tensor]:
+    """Add the shards' gradients, parameter by parameter, into the first shard's."""
+    total, *others = gradients
+    for other in others:
+        torch._foreach_add_(total, other)
+    return total
+
+
 def _learned(network: nn.Module) -> list[nn.Parameter]:
-    """The parameters that are not frozen."""
+    """Return the parameters that are not frozen."""
     return [parameter for parameter in network.parameters() if parameter.requires_grad]
 
 

@@ -152,7 +152,7 @@ class PrioritizedSampler:
         """Forget what the memory has forgotten, and take in what is new."""
         if not self._next_id:
             self._plant(np.zeros(memory.capacity))
-        if self._capacity != memory.capacity or not self._next_id <= memory.next_id:
+        if self._capacity != memory.capacity or not 0 <= self._oldest_id <= self._next_id <= memory.next_id:
             raise Fault(_FOREIGN)
         gone = np.arange(self._oldest_id, min(memory.oldest_id, self._oldest_id + memory.capacity))
         self._set(gone % memory.capacity, np.zeros(len(gone)))

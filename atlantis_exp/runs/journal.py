@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, Protocol, get_args
+from typing import Any, BinaryIO, Literal, get_args
 from uuid import uuid4
 
 from pydantic import ValidationError
@@ -125,8 +125,8 @@ class JournalError(Fault, ValueError):
 _POINT_BYTES = 2_000  # between two points of a curve that are worth reading; three lines of a journal, or so
 
 
-class Tracker(Protocol):
-    """What training may tell about itself."""
+class Tracker:
+    """What training may tell about itself; this one forgets everything."""
 
     def metrics(self, values: Mapping[str, float], step: int) -> None:
         """Record values measured at a step."""
@@ -157,30 +157,13 @@ class Tracker(Protocol):
 
     def state_dict(self) -> dict[str, Any]:
         """Make all records durable and return where they end."""
+        return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go back to where the state ends; later records are forgotten."""
 
 
-class NullJournal:
-    """A tracker that forgets everything."""
-
-    def metrics(self, values: Mapping[str, float], step: int) -> None: ...
-    def params(self, values: Mapping[str, str]) -> None: ...
-    def tags(self, values: Mapping[str, str]) -> None: ...
-    def note(self, markdown: str) -> None: ...
-    def artifact(self, path: str, content: bytes) -> None: ...
-    def image(self, key: str, content: bytes, step: int) -> None: ...
-    def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None: ...
-    def status(self, status: Status, error: str = "") -> None: ...
-    def commit(self) -> None: ...
-    def state_dict(self) -> dict[str, Any]:
-        return {}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None: ...
-
-
-class Journal:
+class Journal(Tracker):
     """A tracker that writes a run folder, which has one writer at a time.
 
     Without `load_state_dict` it begins an empty journal, even in a folder that holds one. Names of metrics, params,

@@ -18,6 +18,7 @@ from atlantis_exp.checking import nearest, parse, to_dict
 from atlantis_exp.config import STRICT, Config, EvaluationConfig, PathsConfig
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.files import ARTIFACT, SMALL, read_file, read_object, write_file
+from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.statistics import interval, resample, summarize
 from atlantis_exp.training.actor import Actor
 from atlantis_exp.training.evaluation import Evaluation
@@ -123,6 +124,7 @@ def build_exported_actor(config: Config, weights: bytes, device: str) -> Actor:
     Raises: Fault.
     """
     exact = replace(config, threads=1, training=replace(config.training, precision="fp32"))
+    set_up_torch(exact, device)
     return build_network_actor(exact, weights, device)
 
 

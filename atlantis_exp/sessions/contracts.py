@@ -27,6 +27,7 @@ from atlantis_exp.networks.sizes import count_parameters
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.sessions.training import expected
 from atlantis_exp.sessions.verifying import fingerprints, train_and_kill
 from atlantis_exp.training.checkpoint import to_safetensors
@@ -293,8 +294,10 @@ def _costs(jobs: Mapping[str, Job]) -> Table:
         column.justify = "right"
     for name, job in jobs.items():
         config = job.config
+        set_up_torch(config, config.device)
         with tempfile.TemporaryDirectory() as folder:
-            trainer = build_trainer(config, Path(folder), Journal(Path(folder)), Progress(terminal.console()))
+            path = Path(folder)
+            trainer = build_trainer(config, job.machine.cores, path, Journal(path), Progress(terminal.console()))
             with trainer.emulators:
                 speed = expected(trainer, config, Counters())
         size, batch = config.env.size, config.training.batch_size

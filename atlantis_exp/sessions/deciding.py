@@ -29,9 +29,10 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import Journal, NullJournal
+from atlantis_exp.runs.journal import Journal, Tracker
 from atlantis_exp.sessions.job import Job, command_line, labels, quoted, replaced
 from atlantis_exp.sessions.page import opened, terminable
+from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.sessions.sweep import ledger
 from atlantis_exp.sessions.training import expected, train
 from atlantis_exp.tracking.publishing import catch_up
@@ -290,7 +291,7 @@ def say_what_it_takes(contest: Contest) -> None:
     hours = 0.0
     for label, runs in missing.items():
         if runs and contest.config.budget.forecast != "off":
-            forecast = _forecast(contest.job(label, 0).config)
+            forecast = _forecast(contest.job(label, 0))
             hours += runs * forecast
             say(f"{label}: {duration(forecast)} a run, alone on this machine")
     if hours:
@@ -310,10 +311,12 @@ def say_what_it_takes(contest: Contest) -> None:
     say(f"(if a contender's seeds differ as {whence}: {100 * spread:.0f} % of their mean, standard deviation)")
 
 
-def _forecast(config: Config) -> float:
+def _forecast(job: Job) -> float:
     """Return the hours that a training takes here."""
+    config = job.config
+    set_up_torch(config, config.device)
     with tempfile.TemporaryDirectory() as aside:
-        trainer = build_trainer(config, Path(aside), NullJournal(), Progress(Console(quiet=True)))
+        trainer = build_trainer(config, job.machine.cores, Path(aside), Tracker(), Progress(Console(quiet=True)))
         with trainer.emulators:
             return expected(trainer, config, Counters()).hours
 

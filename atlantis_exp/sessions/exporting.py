@@ -32,6 +32,7 @@ def export(
     device: str,
     evaluation: EvaluationConfig,
     paths: PathsConfig,
+    cores: int,
 ) -> None:
     """Play the network as it will be handed on, then write it with a card, all of it or nothing."""
     if onnx:
@@ -57,7 +58,7 @@ def export(
     try:
         with whole(folder) as place:  # before the episodes, lest there be no place for their scores
             progress.say(f"{source.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
-            played = build_evaluator(trained.env, settings)(actor, settings.episodes, progress)
+            played = build_evaluator(trained.env, settings, cores)(actor, settings.episodes, progress)
             card = Card(
                 format=1,
                 run=source.name,

@@ -3,11 +3,12 @@
 import re
 import shlex
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
 
 from atlantis_exp.config import Config
+from atlantis_exp.machine import Machine, here
 from atlantis_exp.terminal import PROGRAM
 
 
@@ -18,7 +19,12 @@ class Job:
     config: Config
     words: tuple[str, ...] = ()  # what was asked for besides network, sampler and seed, in few words
     overrides: tuple[str, ...] = ()  # as typed, of this job alone
-    launcher: str | None = None  # of the sweep that this process does one job of, `apart` in a process of its own
+    machine: Machine = field(default_factory=here)
+
+    @property
+    def launcher(self) -> str | None:
+        """The launcher of the sweep that this process does one job of."""
+        return self.machine.launcher
 
     @property
     def command(self) -> str:

@@ -1,6 +1,5 @@
 """How a training is asked to stop: by a signal, by the end of its time, or because its sweep has ended."""
 
-import os
 import signal
 import sys
 import time
@@ -25,8 +24,14 @@ class StopRequest:
     itself requeues or kills it.
     """
 
-    def __init__(self, seconds: float | None = None, sweep_goes_on: Callable[[], bool] = lambda: True) -> None:
+    def __init__(
+        self,
+        seconds: float | None = None,
+        sweep_goes_on: Callable[[], bool] = lambda: True,
+        under_slurm: bool = False,
+    ) -> None:
         self.signal: int | None = None
+        self._under_slurm = under_slurm
         self._is_warned = False  # by Slurm
         self._deadline = inf if seconds is None else time.monotonic() + seconds
         self._sweep_goes_on = sweep_goes_on
@@ -62,7 +67,6 @@ class StopRequest:
         """Listen while the block runs."""
         signals = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
         self._before = {number: signal.signal(number, self._receive) for number in signals}
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)  # as inherited from a launcher's worker
         try:
             yield
         finally:
@@ -73,17 +77,15 @@ class StopRequest:
         if self.signal is not None and number == signal.SIGINT:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
             signal.raise_signal(signal.SIGINT)
-        if number == signal.SIGTERM and "SLURM_JOB_ID" in os.environ:
+        if number == signal.SIGTERM and self._under_slurm:
             self._is_warned = True  # apart, as a SIGUSR2 before it still means that the job is to be requeued
         else:
             self.signal = number
 
 
 def sweep_goes_on(folder: RunFolder, launcher: str | None) -> Callable[[], bool]:
-    """What tells whether the process that launched this job still wants it; Slurm's jobs do without that process."""
-    if folder.parent is None or launcher not in ("joblib", "apart", "ray"):
+    """Return a call that tells whether the process that launched this job still wants it; Slurm's jobs outlive it."""
+    if folder.parent is None or launcher != "joblib":
         return lambda: True
     sweep = RunFolder(folder.parent)
-    if launcher == "ray":  # whose machines may not see each other's locks
-        return lambda: sweep.status == "RUNNING"
     return lambda: sweep.status == "RUNNING" and sweep.is_held

@@ -16,7 +16,7 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import TABLE_COLUMNS, TRACEBACK, RunFolder, State
 from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, adopt
 from atlantis_exp.sessions.job import Job, fitted
-from atlantis_exp.sessions.launchers import BASIC, Launcher, joblib, ray, slurm
+from atlantis_exp.sessions.launchers import BASIC, Launcher, joblib, slurm
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.page import ending, opened, terminable
 from atlantis_exp.tracking.publishing import catch_up
@@ -118,9 +118,7 @@ def _launched(launcher: Launcher, journal: Journal, runs: Runs, close_page: Call
     folders, jobs = list(runs), list(runs.values())
     match launcher.name:
         case "joblib":
-            context: AbstractContextManager[None] = joblib.jobs(journal, jobs, close_page, launcher)
-        case "ray":
-            context = ray.jobs(journal, folders, close_page, launcher)
+            context: AbstractContextManager[None] = joblib.committed_at_the_end(journal, folders, close_page)
         case "slurm":
             context = slurm.all_awaited()
         case _:

@@ -3,14 +3,14 @@
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from atlantis_exp import terminal
 from atlantis_exp.config import PathsConfig, TrackingConfig
 from atlantis_exp.faults import Fault
-from atlantis_exp.runs.folder import all_folders
+from atlantis_exp.runs.folder import RunFolder, all_folders
 from atlantis_exp.tracking.mirror import forget_lost, publish
 from atlantis_exp.tracking.store import Store, first_line
 
@@ -68,14 +68,19 @@ def tell(uri: str, all_sent: Iterable[Sent], is_first: bool) -> None:
         raise Fault(f"to {uri}: {counts['failed']} of {counts.total()} runs failed")
 
 
-def publish_all(outputs: Path, store: Store) -> Iterator[Sent]:
-    """Publish the run folders under `outputs` and yield how each ended. Raises: Fault if the store is out of reach."""
+def publish_all(outputs: Path, store: Store, folders: Sequence[RunFolder] | None = None) -> Iterator[Sent]:
+    """Publish run folders, all under `outputs` by default, and yield how each ended.
+
+    Raises:
+        Fault: if the store is out of reach.
+    """
     try:
         with terminal.working(f"asking {store.uri} for its runs"):
             listed = {run.info.run_id for run in store.runs()}
     except Exception as error:
         raise store.explained(error) from None
-    for folder in (each.path for each in reversed(all_folders(outputs))):  # sweeps before runs, which publish theirs
+    folders = all_folders(outputs) if folders is None else folders
+    for folder in (each.path for each in reversed(folders)):  # sweeps before runs, which publish theirs
         run = str(folder.relative_to(outputs))
         try:
             forget_lost(folder, store, listed)

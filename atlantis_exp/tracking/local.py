@@ -45,11 +45,19 @@ def make_database(root: Path) -> None:
         aside = root / "mlflow.aside"
         shutil.rmtree(aside, ignore_errors=True)
         aside.mkdir()
-        MlflowClient(f"sqlite:///{aside / DATABASE}").search_experiments(max_results=1)
+        MlflowClient(uri_of(aside)).search_experiments(max_results=1)
         (aside / DATABASE).replace(file)
         shutil.rmtree(aside)
     with closing(sqlite3.connect(file)) as database:
         database.execute("PRAGMA journal_mode=WAL")  # else one slow reader makes a write fail
+
+
+def uri_of(root: Path) -> str:
+    """Return the URI of the database of an outputs folder, whatever characters the folder's name has."""
+    from sqlalchemy import URL
+
+    # With the driver's name MLflow makes no folder of the quoted name.
+    return URL.create("sqlite+pysqlite", database=str(root / DATABASE)).render_as_string()
 
 
 def artifacts(root: Path, experiment: str) -> Path:

@@ -135,6 +135,11 @@ def digest(commit: Commit) -> str:
     return sha256(commit_bytes(commit)).hexdigest()
 
 
+def noted(folder: Path) -> list[Cursor]:
+    """Return how far a folder is published in each store."""
+    return [cursor for note in folder.glob("published*.json") if (cursor := Cursor.read(note))]
+
+
 def forget_lost(folder: Path, store: Store, listed: Collection[str]) -> None:
     """Let a folder be published anew if its run is not among those that the store lists."""
     note = _note(folder, store, is_primary=False)

@@ -17,7 +17,7 @@ from atlantis_exp.runs.folder import RunFolder, all_folders
 from atlantis_exp.runs.journal import Journal, read_commit
 from atlantis_exp.terminal import PROGRAM
 from atlantis_exp.tracking.local import DATABASE
-from atlantis_exp.tracking.mirror import PRIMARY, Cursor, digest, publish
+from atlantis_exp.tracking.mirror import PRIMARY, Cursor, digest, noted, publish
 from atlantis_exp.tracking.store import Store, first_line
 
 _log = logging.getLogger(__name__)
@@ -156,9 +156,20 @@ def catch_up(
         terminal.warn(f"{uri} lacks parts of {runs} runs; {PROGRAM} sync {quote(f'to={uri}')} sends them")
 
 
-def how_to_open(outputs: Path) -> str:
-    """Return a paragraph that says how to open the UI on the store of an outputs folder, empty if there is no store."""
+def lacking(outputs: Path) -> list[RunFolder]:
+    """Return the folders that were never published in the local store, all if it is gone."""
+    folders = [folder for folder in all_folders(outputs) if (folder.path / "journal.jsonl").exists()]
     if not (outputs / DATABASE).exists():
+        return folders
+    store = f"{Store(outputs).uri}#"
+    return [folder for folder in folders if not any(note.store.startswith(store) for note in noted(folder.path))]
+
+
+def how_to_open(outputs: Path) -> str:
+    """Return a paragraph that says how to open the UI on the store of an outputs folder, empty if there is no run."""
+    missing = len(lacking(outputs))
+    if not missing and not (outputs / DATABASE).exists():
         return ""
     shown = outputs.relative_to(Path.cwd()) if outputs.is_relative_to(Path.cwd()) else outputs
-    return f"\nthe MLflow UI: {PROGRAM} ui paths.outputs={shown}\n"
+    command = f"{PROGRAM} ui {quote(f'paths.outputs={shown}')}"
+    return f"\nthe MLflow UI: {command}{f' (publishes {missing:,} runs that it lacks first)' if missing else ''}\n"

@@ -145,8 +145,8 @@ class Store:
         """Return the store's fault after an error, None if it answers: then the folder being published is to blame."""
         if isinstance(error, ValueError):  # raised for a folder's own files
             return None
-        busy = getattr(error, "error_code", "") == "TEMPORARILY_UNAVAILABLE"
-        if busy or isinstance(error, Fault | TooSlow | sqlite3.Error):
+        is_busy = getattr(error, "error_code", "") == "TEMPORARILY_UNAVAILABLE"
+        if is_busy or isinstance(error, Fault | TooSlow | sqlite3.Error) or self._is_unusable(error):
             return self.explained(error)
         try:
             self.client.get_experiment(self.experiment_id)
@@ -159,10 +159,13 @@ class Store:
         if isinstance(error, Fault):
             return error
         reason = first_line(error)
-        if not self.is_local or not any(text in str(error) for text in _UNUSABLE):
+        if not self._is_unusable(error):
             return Fault(f"{self.uri} cannot be reached: {reason}")
         again = f"{PROGRAM} sync {quote(f'paths.outputs={self._root}')}"
         return Fault(f"{self._root / DATABASE} cannot be used ({reason}): move it away, and {again} makes it again")
+
+    def _is_unusable(self, error: Exception) -> bool:
+        return self.is_local and any(reason in str(error) for reason in _UNUSABLE)
 
     @cached_property
     def _connection(self) -> tuple["MlflowClient", str]:
@@ -179,12 +182,12 @@ class Store:
         logging.getLogger("mlflow").setLevel(logging.CRITICAL)
         logging.getLogger("alembic").setLevel(logging.WARNING)
         with alone(self._root / "mlflow.lock"):  # processes that make the tables together break them for good
-            client = MlflowClient(self.uri)
             if not self.is_local:
-                client = cast("MlflowClient", PatientClient(client, self._patience))
+                client = cast("MlflowClient", PatientClient(MlflowClient(self.uri), self._patience))
                 return client, self._opened_experiment(client)
             try:
                 local.make_database(self._root)
+                client = MlflowClient(local.uri_of(self._root))
                 client.search_experiments(max_results=1)  # MLflow checks the version of the tables
                 if before := local.follow(self._root):
                     _log.warning("%s was moved or copied from %s: its MLflow store follows", self._root, before)

@@ -5,10 +5,17 @@ A shared view is a tag of the experiment in a format that MLflow keeps to itself
 
 import base64
 import json
+import os
+import warnings
 import zlib
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
 
 from atlantis_exp.runs.journal import NOTE
+from atlantis_exp.tracking.local import uri_of
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
 
 _SECTIONS = {  # cards a row, and their height in pixels
     "evaluation": (2, 360),
@@ -70,6 +77,24 @@ def address(server: str, experiment_id: str, view: str) -> str:
         f"{server}/#/experiments/{experiment_id}/runs?workflowType=machine_learning&compareRunsMode={mode}"
         f"&viewStateShareKey={view}"
     )
+
+
+def site(outputs: Path, start: str) -> "FastAPI":
+    """Return MLflow's server on the store of an outputs folder, whose plain address leads to `start`."""
+    os.environ["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] = "false"  # ten processes otherwise
+    from mlflow.server.constants import BACKEND_STORE_URI_ENV_VAR
+
+    os.environ[BACKEND_STORE_URI_ENV_VAR] = uri_of(outputs.resolve())  # before the next import, which reads it
+    from mlflow.server import app as pages
+
+    with warnings.catch_warnings(action="ignore"):  # of a library that MLflow will replace
+        from mlflow.server.fastapi_app import app
+
+    # What is behind '#' is not sent to a server: the page itself has to look.
+    lead = f"<head><script>if (!location.hash) location.replace({json.dumps(start)})</script>"
+    index = Path(str(pages.static_folder), "index.html").read_text().replace("<head>", lead, 1)
+    pages.view_functions["serve"] = lambda: index
+    return cast("FastAPI", app)
 
 
 def _start_here() -> dict[str, Any]:

@@ -9,7 +9,7 @@ from pydantic import Field
 from atlantis_exp.learning.schedules import Schedule
 from atlantis_exp.replay.memory import Returns
 from atlantis_exp.replay.samplers import Sampler
-from atlantis_exp.runs.files import schema_of
+from atlantis_exp.runs.files import checked
 
 Unit = Literal["episodes", "steps"]
 Count = Annotated[int, Field(ge=0, lt=2**53)]
@@ -29,7 +29,7 @@ class Counters:
     @classmethod
     def of(cls, saved: Mapping[str, Any]) -> Self:
         """Return the counters that a checkpoint holds. Raises: KeyError, TypeError, ValueError."""
-        counters = schema_of(cls).validate_python({field.name: saved[field.name] for field in fields(cls)})
+        counters = checked(cls, {field.name: saved[field.name] for field in fields(cls)})
         if counters.episodes > counters.steps:
             raise ValueError(f"{counters.episodes} episodes in {counters.steps} steps")
         return counters

@@ -16,7 +16,7 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.media import score_heatmap, score_histogram
 from atlantis_exp.replay.memory import ReplayMemory
-from atlantis_exp.runs.files import schema_of
+from atlantis_exp.runs.files import checked
 from atlantis_exp.runs.folder import BEST_EPISODE, EPISODES, EVALUATED, NETWORK, TABLE_COLUMNS, evaluation_at
 from atlantis_exp.runs.journal import Tracker
 from atlantis_exp.training.checkpoint import to_safetensors
@@ -52,7 +52,7 @@ class _Saved:
     owes_evaluation: bool
     best_step: Annotated[int, Field(ge=-1, lt=2**53)]
     last_report: str
-    last_metrics: dict[str, float]
+    last_metrics: dict[str, int | float]  # as they were, for resume is bit for bit
     best_sha256: str = ""  # 0.1.0 has none
 
 
@@ -243,7 +243,7 @@ class Recorder:
             self.episodes.append(Played(int(episode), int(step), int(frames), score, int(length), int(env)))
         if not np.isfinite(self.recent_scores(len(self.episodes))).all():
             raise ValueError("the scores are not finite")
-        saved = schema_of(_Saved).validate_python(state)
+        saved = checked(_Saved, state)
         self.best_mean = -np.inf if saved.best_mean is None else saved.best_mean
         self.evaluations, self.evaluated_at = saved.evaluations, saved.evaluated_at
         self.evaluation_pending, self.best_step = saved.owes_evaluation, saved.best_step

@@ -46,7 +46,10 @@ Command = Callable[..., int]
         (("model=cnn,resnet", "error=0"), "error=0: should be greater than or equal to 1e-06"),
         (("model=cnn,resnet", "look=now"), "look=now: no such key"),
         (("model=cnn,resnet", "evaluation.at_end=false"), "evaluation.at_end=false: contenders are compared by the "),
-        (("model=cnn,resnet", "hydra/launcher=joblb"), "In 'hydra/config': Could not find 'hydra/launcher/joblb'"),
+        (
+            ("model=cnn,resnet", "hydra/launcher=joblb"),
+            "hydra/launcher=joblb: no such launcher; did you mean 'joblib'?",
+        ),
         (("model=cnn,resnet", "against=env.stack=2"), "model=cnn,resnet: several values, and against= as well; write"),
         (("against=seed=3,model=cnn",), "seed: says how contenders are trained or measured, not what they are; one"),
         (("against=model=cnn",), "model=cnn: the same contender as the config without it"),

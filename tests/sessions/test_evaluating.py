@@ -97,7 +97,7 @@ def test_a_held_button_scores_2000_and_the_run_holds_its_report_table_picture_an
     words = ("agent=constant", "env.workers=1", "evaluation.episodes=2", "evaluation.num_envs=1")
     config = composed("baseline", BaselineConfig, *words, f"paths.outputs={tmp_path}")
     name = config.run_name()
-    play_baseline(**vars(config), name=name, title=config.title(), command="python -m atlantis_exp baseline")
+    play_baseline(**vars(config), name=name, title=config.title(), command="python -m atlantis_exp baseline", cores=1)
     printed = capsys.readouterr().out
     assert "avg score: 2000.0  high score: 2000.0  low score: 2000.0" in printed
 
@@ -152,7 +152,7 @@ def press(pygame: Any, key: int) -> None:
 
 def play_composed(outputs: Path, *overrides: str) -> None:
     short = ("player=ann", "env.max_steps=20", "evaluation.video=false", "tracking=none", f"paths.outputs={outputs}")
-    play(**vars(composed("play", PlayConfig, *short, *overrides)), command="python -m atlantis_exp play")
+    play(**vars(composed("play", PlayConfig, *short, *overrides)), command="python -m atlantis_exp play", cores=1)
 
 
 def test_a_persons_episode_is_a_run_that_a_comparison_finds(

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from atlantis_exp.commands import CONF
+from atlantis_exp.commands import CHECKOUT, CONF
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.components import ENTRY_POINTS, KINDS, admit
 from atlantis_exp.config import Config
 from atlantis_exp.sessions.contracts import trials
 from atlantis_exp.sessions.job import Job, replaced
-from atlantis_exp.sessions.new import begin
+from atlantis_exp.sessions.new import EXAMPLES, begin
 
 
 @pytest.fixture(autouse=True)
@@ -70,6 +70,13 @@ def test_a_package_that_cannot_be_is_one_line(
 ) -> None:
     assert command("new", *words) == 2
     assert reason in capsys.readouterr().err
+
+
+def test_a_wheel_brings_the_examples_that_packages_are_made_of() -> None:
+    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())
+    brought = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
+    assert (brought["conf"], brought["examples"]) == ("atlantis_exp/conf", "atlantis_exp/examples")
+    assert all((CHECKOUT / "examples" / f"{example}.py").is_file() for example, _ in EXAMPLES.values())
 
 
 def test_what_is_written_is_whole_or_not_there(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import PIL.Image
 
@@ -77,7 +78,7 @@ def everything(root: Path, folder: Path) -> dict[str, Any]:
     models = rows(
         root, "SELECT model_id, name, status, artifact_location FROM logged_models WHERE source_run_id = ?", run
     )
-    artifacts = Path(location.removeprefix("file://"))
+    artifacts = _path(location)
     return {
         "status": status,
         "name": name,
@@ -87,10 +88,7 @@ def everything(root: Path, folder: Path) -> dict[str, Any]:
         "files": {
             str(file.relative_to(artifacts)): file.read_bytes() for file in artifacts.rglob("*") if file.is_file()
         },
-        "models": [
-            (*model[:3], [file.read_bytes() for file in Path(model[3].removeprefix("file://")).iterdir()])
-            for model in models
-        ],
+        "models": [(*model[:3], [file.read_bytes() for file in _path(model[3]).iterdir()]) for model in models],
         "model metrics": rows(
             root,
             "SELECT metric_name, metric_step, metric_value FROM logged_model_metrics WHERE run_id = ? ORDER BY 2, 1",
@@ -98,6 +96,10 @@ def everything(root: Path, folder: Path) -> dict[str, Any]:
         ),
         "outputs": rows(root, "SELECT destination_id, step FROM inputs WHERE source_id = ? ORDER BY step", run),
     }
+
+
+def _path(uri: str) -> Path:
+    return Path(unquote(uri.removeprefix("file://")))
 
 
 def same_but_for_ids(shown: dict[str, Any]) -> dict[str, Any]:

@@ -526,3 +526,25 @@ def test_a_file_that_is_newer_than_the_commit_waits_for_its_own(tmp_path: Path, 
     journal.flush()
     publish(tmp_path, store)
     assert film() == b"third"
+
+
+def test_a_folder_that_begins_anew_while_it_is_read_is_read_again(tmp_path: Path, root: Path) -> None:
+    """As a comparison does that is made again while another process publishes it."""
+
+    class Meanwhile(Store):
+        anew = False
+
+        def open_run(self, folder: Path, commit: Commit) -> Any:
+            if not self.anew:
+                self.anew = True
+                journal = Journal(folder)
+                journal.metrics({"score": 1.0}, 1)
+                journal.finish()
+            return super().open_run(folder, commit)
+
+    a_full_journal(tmp_path)
+    assert publish(tmp_path, Meanwhile(root))
+    assert points(root, tmp_path) == journaled_points(tmp_path)
+    assert everything(root, tmp_path)["status"] == "FINISHED"
+    identity = read_commit(tmp_path).identity  # type: ignore[union-attr]
+    assert rows(root, "SELECT run_uuid FROM tags WHERE value = ?", identity) == [(run_id(tmp_path),)]

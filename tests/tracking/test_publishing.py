@@ -16,7 +16,7 @@ from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal, adopt, read_commit
 from atlantis_exp.tracking import publishing
 from atlantis_exp.tracking.mirror import Cursor, publish
-from atlantis_exp.tracking.publishing import Publisher, catch_up, unfinished
+from atlantis_exp.tracking.publishing import Publisher, catch_up, how_to_open, lacking, unfinished
 from atlantis_exp.tracking.store import Store
 from tests.tracking.folders import (
     a_full_journal,
@@ -54,6 +54,25 @@ def test_a_folder_whose_commit_is_not_a_file_is_one_line(
     said = capsys.readouterr().err
     assert said.startswith(f"atlantis_exp: {folder / 'commit.json'} is damaged")
     assert said.count("\n") == 1
+
+
+def test_the_way_to_the_ui_says_how_many_runs_the_store_lacks(tmp_path: Path) -> None:
+    outputs = tmp_path / "a b"
+    command = f"\nthe MLflow UI: python -m atlantis_exp ui 'paths.outputs={outputs}'"
+    assert how_to_open(outputs) == ""
+    runs = [outputs / "runs" / name for name in ("first", "second")]
+    for folder in runs:
+        a_full_journal(folder)
+    adopt(outputs / "runs" / "queued", runs[0])
+    assert how_to_open(outputs) == f"{command} (publishes 2 runs that it lacks first)\n"
+    publish(runs[0], Store(outputs))
+    with pytest.raises(Exception, match="refused"):
+        publish(runs[1], Store(outputs, tracking_uri="http://127.0.0.1:9"))
+    assert [folder.path for folder in lacking(outputs)] == [runs[1]]
+    publish(runs[1], Store(outputs), is_primary=False)
+    assert how_to_open(outputs) == f"{command}\n"
+    (outputs / "mlflow.db").unlink()
+    assert how_to_open(outputs) == f"{command} (publishes 2 runs that it lacks first)\n"
 
 
 def test_a_publisher_follows_the_run_until_it_is_drained(tmp_path: Path, root: Path, store: Store) -> None:

@@ -1,14 +1,22 @@
+import re
 import signal
+import sqlite3
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
+from mlflow.exceptions import MlflowException
 
+from atlantis_exp.faults import Fault
 from atlantis_exp.runs.journal import Journal
+from atlantis_exp.sessions.syncing import publish_all
 from atlantis_exp.tracking.mirror import publish
+from atlantis_exp.tracking.publishing import Publisher
 from atlantis_exp.tracking.store import Store
-from tests.tracking.folders import commit, rows
+from tests.tracking.folders import a_full_journal, commit, journaled_points, points, rows
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -76,3 +84,68 @@ publish(folder, Store(Path({str(tmp_path)!r}, "store")))
     assert [process.returncode for process in processes] == [0] * 8
     assert rows(tmp_path / "store", "SELECT count(*) FROM metrics") == [(8,)]
     assert rows(tmp_path / "store", "SELECT count(*) FROM experiments WHERE name = 'atlantis'") == [(1,)]
+
+
+def test_an_experiment_that_was_deleted_is_restored_and_a_line_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "runs" / "run"
+    journal = a_full_journal(folder)
+    publish(folder, store := Store(tmp_path))
+    store.client.delete_experiment(store.experiment_id)
+    journal.status("FINISHED")
+    publish(folder, Store(tmp_path))
+    assert rows(tmp_path, "SELECT status, lifecycle_stage FROM runs") == [("FINISHED", "active")]
+    assert [record.getMessage() for record in caplog.records] == [
+        "The MLflow experiment atlantis had been deleted: it is restored, with its runs"
+    ]
+
+
+def damage(database: Path) -> None:
+    database.write_bytes(b"no database" * 1_000)
+
+
+def age(database: Path) -> None:
+    with closing(sqlite3.connect(database)) as opened, opened:
+        opened.execute("UPDATE alembic_version SET version_num = '6953534de441'")
+
+
+def renew(database: Path) -> None:
+    with closing(sqlite3.connect(database)) as opened, opened:
+        opened.execute("UPDATE alembic_version SET version_num = 'ffffffffffff'")
+
+
+@pytest.mark.parametrize("spoil", [damage, age, renew])
+def test_a_database_that_cannot_be_used_is_one_line_with_the_remedy_for_every_command(
+    tmp_path: Path,
+    mlflow_tables: Callable[[Path], None],
+    caplog: pytest.LogCaptureFixture,
+    spoil: Callable[[Path], None],
+) -> None:
+    mlflow_tables(tmp_path)
+    spoil(tmp_path / "mlflow.db")
+    folder = tmp_path / "runs" / "run"
+    a_full_journal(folder)
+    remedy = rf"move it away, and .* sync paths.outputs={tmp_path} makes it again"
+    said = rf"{tmp_path}/mlflow.db cannot be used \(.*\): {remedy}"
+    with pytest.raises(Fault, match=said):
+        [*publish_all(tmp_path, Store(tmp_path))]
+    with pytest.raises(Fault, match=said):
+        Store(tmp_path).prepare()
+    publisher = Publisher(folder, Store(tmp_path))
+    assert not publisher.drain(2.0)
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert re.fullmatch(rf"Publishing to MLflow fails \({said}\); the run goes on and is published later", line)
+    (tmp_path / "mlflow.db").rename(tmp_path / "away.db")
+    assert publisher.drain(120)
+    assert points(tmp_path, folder) == journaled_points(folder)
+
+
+def test_a_database_that_breaks_while_it_is_used_is_the_stores_fault(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    assert store.client
+    error = MlflowException("(sqlite3.DatabaseError) database disk image is malformed")
+    assert "move it away" in str(store.fault(error))
+    assert "move it away" in str(store.fault(sqlite3.DatabaseError("database disk image is malformed")))
+    assert store.fault(ValueError("a folder's own")) is None
+    assert store.fault(OverflowError("too large")) is None

@@ -1,77 +1,107 @@
-"""Jobs side by side on this machine, each in a process of its own: whatever ends it, the others go on."""
+"""Jobs side by side on this machine, each in a process of its own: if one ends, the others go on."""
 
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
-from multiprocessing import resource_tracker
+from types import FrameType
+from typing import NoReturn
 
+from atlantis_exp import terminal
 from atlantis_exp.faults import Fault
+from atlantis_exp.machine import JOB_OF, all_cores
 from atlantis_exp.runs.files import make_folder, no_link
 from atlantis_exp.runs.folder import OUTPUT, RunFolder
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
-from atlantis_exp.sessions.launchers import APART, JOB_OF, Launcher, committed_at_the_end
+from atlantis_exp.sessions.launchers import Launcher
 from atlantis_exp.sessions.stopping import sweep_goes_on
 
+_STOP_SECONDS = 300.0  # that jobs have to commit once their sweep ends
+
 
 @contextmanager
-def jobs(
-    journal: Journal, trainings: Sequence[Job], close_page: Callable[[], None], launcher: Launcher
+def committed_at_the_end(
+    journal: Journal, folders: Sequence[RunFolder], close_page: Callable[[], None]
 ) -> Iterator[None]:
-    """Share the cores among the workers that the block starts, and have all jobs commit at its end."""
-    from joblib.externals.loky.backend import resource_tracker as its_own
+    """Have all jobs commit before the sweep ends; after SIGINT or SIGTERM its exit code is a run's."""
+    own = [folder for folder in folders if not folder.is_held]
 
-    with _shared_cores(launcher, trainings):
-        for tracker in (resource_tracker, its_own):
-            tracker.ensure_running()  # started later, it would lift the mask
-        # A worker that a signal ends would take all others along: they inherit the mask. The signals reach this
-        # process all the same, through its other threads.
-        folders = [RunFolder.of(job.config) for job in trainings]
-        with committed_at_the_end(journal, folders, close_page, is_masked=True):
-            yield
+    def stop() -> None:
+        close_page()  # it writes the journal, too
+        patience = time.monotonic() + _STOP_SECONDS
+        if any(folder.is_held for folder in own):
+            journal.status("KILLED")  # the jobs look at it
+            while any(folder.is_held for folder in own) and time.monotonic() < patience:
+                time.sleep(0.2)
 
+    def end(number: int, _: FrameType | None) -> NoReturn:
+        signal.signal(number, signal.SIG_DFL)  # a second one ends the process at once
+        terminal.warn(f"{signal.Signals(number).name}: the jobs commit and end")
+        stop()
+        sys.exit(128 + number)
 
-@contextmanager
-def _shared_cores(launcher: Launcher, trainings: Sequence[Job]) -> Iterator[None]:
-    """Tell the workers their share of the cores, unless a person has."""
-    if "OMP_NUM_THREADS" in os.environ:
-        yield
-        return
-    from joblib import cpu_count, effective_n_jobs
-
-    left = sum(RunFolder.of(job.config).ended(job.config.budget.steps) is None for job in trainings)
-    at_once = min(effective_n_jobs(launcher.n_jobs), left)
-    share = str(max(cpu_count() // max(at_once, 1), 1))
-    os.environ |= {"OMP_NUM_THREADS": share, "MKL_NUM_THREADS": share}
+    handlers = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        del os.environ["OMP_NUM_THREADS"], os.environ["MKL_NUM_THREADS"]
+        stop()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
-def train_apart(job: Job) -> None:
+def train_side_by_side(jobs: Sequence[Job], launcher: Launcher) -> None:
+    """Train jobs, as many at a time as the launcher says and the cores divided among them.
+
+    Raises:
+        Fault: the first job's that failed, once all have ended.
+    """
+    at_once, share = shared(all_cores(), launcher.settings["n_jobs"], jobs)
+    # A person's own number of threads goes before.
+    environment = {"OMP_NUM_THREADS": f"{share}", "MKL_NUM_THREADS": f"{share}", **os.environ}
+    with ThreadPoolExecutor(at_once, "job") as pool:
+        futures = [pool.submit(train_apart, job, environment) for job in jobs]
+        try:
+            wait(futures)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    for future in futures:
+        future.result()
+
+
+def shared(cores: int, n_jobs: int, jobs: Sequence[Job]) -> tuple[int, int]:
+    """Return how many jobs are trained at a time, and the cores of each.
+
+    n_jobs: at a time; below zero, that many fewer than one a core and one more, as joblib counts them.
+    """
+    left = sum(RunFolder.of(job.config).ended(job.config.budget.steps) is None for job in jobs)
+    at_once = max(min(n_jobs if n_jobs > 0 else cores + 1 + n_jobs, left), 1)
+    return at_once, max(cores // at_once, 1)
+
+
+def train_apart(job: Job, environment: Mapping[str, str]) -> None:
     """Train in a process of its own. Raises: Fault where the run fails."""
     config, folder = job.config, RunFolder.of(job.config)
     if folder.ended(config.budget.steps) is not None:
         return
-    if not sweep_goes_on(folder, job.launcher)():
+    if not sweep_goes_on(folder, "joblib")():
         raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
     make_folder(folder.path)
     with open(folder.path / OUTPUT, "a+", opener=no_link) as output:
         start = output.tell()
         code = subprocess.run(
             [sys.executable, "-m", "atlantis_exp", "train", *job.overrides],
-            env={**os.environ, JOB_OF: APART},
+            env={**environment, JOB_OF: "joblib"},
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=output,
             check=False,
         ).returncode
-        if folder.parent and not RunFolder(folder.parent).is_held:
-            os._exit(code)  # the process that this worker works for was killed: there is nobody to tell
         output.seek(start)
         said = output.read().splitlines()
     if code == 0:
