@@ -21,7 +21,7 @@ from atlantis_exp.runs.folder import TRACEBACK, RunFolder, State
 from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, adopt, curve, fitted
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.job import Job
-from atlantis_exp.sessions.launchers import BASIC, Launcher, joblib, slurm
+from atlantis_exp.sessions.launchers import BASIC, Launcher, slurm
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.tracking.publishing import catch_up, publishing
 
@@ -103,8 +103,8 @@ def _page(
             error: BaseException | None = None
             try:
                 with (
-                    _every(_PAGE_SECONDS, lambda: _describe(journal, jobs, folders)) as close,
-                    _launched(launcher, journal, jobs, folders, close),
+                    _every(_PAGE_SECONDS, lambda: _describe(journal, jobs, folders)),
+                    _launched(launcher, jobs, folders),
                 ):
                     yield
             except BaseException as raised:
@@ -120,24 +120,12 @@ def _page(
 
 
 @contextmanager
-def _launched(
-    launcher: Launcher,
-    journal: Journal,
-    jobs: Sequence[Job],
-    folders: Sequence[RunFolder],
-    close_page: Callable[[], None],
-) -> Iterator[None]:
+def _launched(launcher: Launcher, jobs: Sequence[Job], folders: Sequence[RunFolder]) -> Iterator[None]:
     """Show the jobs of a launcher while it runs them, in the context that it needs."""
     if launcher.is_basic:
         yield
         return
-    match launcher.name:
-        case "joblib":
-            context: AbstractContextManager[None] = joblib.committed_at_the_end(journal, folders, close_page)
-        case "slurm":
-            context = slurm.all_awaited()
-        case _:
-            context = nullcontext()
+    context: AbstractContextManager[None] = slurm.all_awaited() if launcher.name == "slurm" else nullcontext()
     table = LiveTable(jobs, folders)
     with context:
         try:
@@ -148,8 +136,8 @@ def _launched(
 
 
 @contextmanager
-def _every(seconds: float, look: Callable[[], None]) -> Iterator[Callable[[], None]]:
-    """Calls `look` now and then in a thread, until the block or a call of what it yields ends."""
+def _every(seconds: float, look: Callable[[], None]) -> Iterator[None]:
+    """Call `look` now and then in a thread until the block ends."""
     closing = threading.Event()
 
     def run() -> None:
@@ -157,16 +145,13 @@ def _every(seconds: float, look: Callable[[], None]) -> Iterator[Callable[[], No
             with suppress(OSError, ValueError, Fault):  # the next look may fare better
                 look()
 
-    def close() -> None:
-        closing.set()
-        thread.join()
-
     thread = threading.Thread(target=run, name=f"every {seconds:g} s", daemon=True)
     thread.start()
     try:
-        yield close
+        yield
     finally:
-        close()
+        closing.set()
+        thread.join()
 
 
 @contextmanager
