@@ -57,6 +57,7 @@ def flags_of(arguments: Sequence[str]) -> argparse.Namespace:
     if flags.resolve and not flags.cfg:
         raise ConfigError("--resolve: is about what is printed instead of the work; add --cfg job")
     flags.config_dir = flags.config_dir and absolute("--config-dir", flags.config_dir)
+    flags.overrides = [text.lstrip("+") for text in flags.overrides]  # every key is there already
     return flags
 
 
@@ -279,14 +280,15 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
     overrides = {text: read_override(text) for text in texts}
     groups = _groups(config_name)
     chosen = tuple(text for text, override in overrides.items() if _key(override) in groups)
+    for text, override in overrides.items():
+        if override.is_delete() and not _key(override).startswith("phase."):
+            raise ConfigError(f"{text}: needed; write {text[1:].partition('=')[0]}=VALUE")
     for text in chosen:
         override = overrides[text]
         folder, value = override.key_or_group, override.value()
         places = (CONF, own) if own is not None else (CONF,)
         options = {path.stem for place in places for path in (place / folder).glob("*.yaml")}
         options |= {component.name for component in admitted().values() if component.kind == folder}
-        if override.is_delete():
-            raise ConfigError(f"{text}: needed; choose with {folder}=OPTION (valid: {', '.join(sorted(options))})")
         if not isinstance(value, str) or value not in options:
             hint = "; one of your own needs plugins=./FILE.py" if folder in KINDS and not admitted() else ""
             raise ConfigError(
@@ -295,14 +297,9 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
             )
     values = {text: override for text, override in overrides.items() if text not in chosen}
     try:
-        if any(each.is_add() or each.is_force_add() or each.is_delete() for each in values.values()):
-            _check_keys(values, _keys(config_name, chosen, own), groups)
         try:
             composed = _composed(config_name, tuple(texts), own)
-        except (HydraException, ValueError) as error:  # mostly no such key; to know all takes as long as to compose
-            for text in chosen:
-                if overrides[text].is_add() and str(error).startswith(f"Multiple values for {_key(overrides[text])}."):
-                    raise ConfigError(f"{text}: the config chooses one already; write {text[1:]}") from None
+        except (HydraException, ValueError):  # mostly no such key; to know all takes as long as to compose
             _check_keys(values, _keys(config_name, chosen, own), groups)
             raise
         if OmegaConf.select(composed, "plugins") and "plugins" not in {_key(each) for each in overrides.values()}:
@@ -316,16 +313,12 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
 
 
 def _check_keys(values: Mapping[str, Override], keys: frozenset[str], groups: set[str]) -> None:
-    """Refuse overrides of keys that are not there, that are added though they are, and that are needed."""
+    """Refuse overrides of keys that are not there."""
     branches = {key.rsplit(".", depth)[0] for key in keys for depth in range(1, key.count(".") + 1)}
     for text, override in values.items():
         key = _key(override)
         if key not in keys | branches:
             raise ConfigError(f"{text}: no such key; {_nearest_key(key, keys | branches | groups)}")
-        if override.is_add() and key in keys:
-            raise ConfigError(f"{text}: the key is there already; write {text.removeprefix('+')}")
-        if override.is_delete() and not key.startswith("phase."):
-            raise ConfigError(f"{text}: needed; change it with {key}=VALUE")
 
 
 def _check_config_dir(folder: Path) -> None:

@@ -88,4 +88,4 @@ def sweep_goes_on(folder: RunFolder, launcher: str | None) -> Callable[[], bool]
     if folder.parent is None or launcher != "joblib":
         return lambda: True
     sweep = RunFolder(folder.parent)
-    return lambda: sweep.status == "RUNNING" and sweep.is_held
+    return lambda: sweep.is_held

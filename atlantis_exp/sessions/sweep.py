@@ -16,7 +16,7 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import TABLE_COLUMNS, TRACEBACK, RunFolder, State
 from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, adopt
 from atlantis_exp.sessions.job import Job, fitted
-from atlantis_exp.sessions.launchers import BASIC, Launcher, joblib, slurm
+from atlantis_exp.sessions.launchers import BASIC, Launcher, slurm
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.page import ending, opened, terminable
 from atlantis_exp.tracking.publishing import catch_up
@@ -102,7 +102,7 @@ def _page(runs: Runs, swept: Sequence[str], launcher: Launcher, command: str) ->
         describe = partial(_describe, journal, runs)
         describe()
         try:
-            with _every(_PAGE_SECONDS, describe) as close_page, _launched(launcher, journal, runs, close_page):
+            with _every(_PAGE_SECONDS, describe), _launched(launcher, runs):
                 yield
         finally:
             _tabulate(journal, runs)
@@ -110,26 +110,19 @@ def _page(runs: Runs, swept: Sequence[str], launcher: Launcher, command: str) ->
 
 
 @contextmanager
-def _launched(launcher: Launcher, journal: Journal, runs: Runs, close_page: Callable[[], None]) -> Iterator[None]:
+def _launched(launcher: Launcher, runs: Runs) -> Iterator[None]:
     """Show the jobs of a launcher while it runs them, in the context that it needs."""
     if launcher.is_basic:
         yield
         return
-    folders, jobs = list(runs), list(runs.values())
-    match launcher.name:
-        case "joblib":
-            context: AbstractContextManager[None] = joblib.committed_at_the_end(journal, folders, close_page)
-        case "slurm":
-            context = slurm.all_awaited()
-        case _:
-            context = nullcontext()
-    with context, closing(LiveTable(jobs, folders)) as table, _every(table.seconds, table.look):
+    context: AbstractContextManager[None] = slurm.all_awaited() if launcher.name == "slurm" else nullcontext()
+    with context, closing(LiveTable([*runs.values()], [*runs])) as table, _every(table.seconds, table.look):
         yield
 
 
 @contextmanager
-def _every(seconds: float, look: Callable[[], None]) -> Iterator[Callable[[], None]]:
-    """Call `look` now and then in a thread, until the block ends or the function that is yielded is called."""
+def _every(seconds: float, look: Callable[[], None]) -> Iterator[None]:
+    """Call `look` now and then in a thread until the block ends."""
     closing = threading.Event()
 
     def run() -> None:
@@ -137,16 +130,13 @@ def _every(seconds: float, look: Callable[[], None]) -> Iterator[Callable[[], No
             with suppress(OSError, ValueError, Fault):  # the next look may fare better
                 look()
 
-    def close() -> None:
-        closing.set()
-        thread.join()
-
     thread = threading.Thread(target=run, name=f"every {seconds:g} s", daemon=True)
     thread.start()
     try:
-        yield close
+        yield
     finally:
-        close()
+        closing.set()
+        thread.join()
 
 
 def _ending(runs: Runs, error: BaseException | None) -> tuple[Status, str]:

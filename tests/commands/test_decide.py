@@ -48,7 +48,7 @@ Command = Callable[..., int]
         (("model=cnn,resnet", "evaluation.at_end=false"), "evaluation.at_end=false: contenders are compared by the "),
         (
             ("model=cnn,resnet", "hydra/launcher=joblb"),
-            "hydra/launcher=joblb: no such launcher; did you mean 'joblib'?",
+            "hydra/launcher=joblb: no such launcher; did you mean",
         ),
         (("model=cnn,resnet", "against=env.stack=2"), "model=cnn,resnet: several values, and against= as well; write"),
         (("against=seed=3,model=cnn",), "seed: says how contenders are trained or measured, not what they are; one"),
@@ -73,8 +73,8 @@ def test_a_question_that_cannot_be_decided_is_one_line_and_code_2_and_leaves_not
     ("words", "reason"),
     [
         ("model=cnn model=cnn,resnet", "model=cnn,resnet: model=cnn says something else"),
-        ("model=cnn,resnet ++seed=3", "++seed=3: decide trains seeds from 0 on"),
-        ("model=cnn,resnet ++resume=never", "++resume=never: decide goes on"),
+        ("model=cnn,resnet ++seed=3", "seed=3: decide trains seeds from 0 on"),
+        ("model=cnn,resnet ++resume=never", "resume=never: decide goes on"),
     ],
 )
 def test_a_key_is_refused_however_it_is_written(words: str, reason: str) -> None:

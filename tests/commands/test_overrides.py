@@ -41,8 +41,8 @@ SCHEMAS: dict[str, type[Any]] = {
 MISTAKES = [  # what is written, and what the one line must hold
     # keys
     ("modle=cnn", "modle=cnn", "'model'"),
-    ("+modle=cnn", "+modle=cnn", "'model'"),
-    ("++modle=cnn", "++modle=cnn", "'model'"),
+    ("+modle=cnn", "modle=cnn", "'model'"),
+    ("++modle=cnn", "modle=cnn", "'model'"),
     ("lr=0.1", "lr=0.1", "'optimizer.lr'"),
     ("optimizer.l=1", "optimizer.l", "'optimizer.lr'"),
     ("++optimizer.l=1", "optimizer.l", "'optimizer.lr'"),
@@ -54,9 +54,8 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("model@foo=cnn", "model@foo", "'model'"),
     ("sampler@samplers.foo=uniform", "sampler@samplers.foo", "'sampler@samplers."),
     ("+samplers.mine={name:uniform}", "samplers.mine", "samplers.uniform"),
-    ("+optimizer.lr=0.1", "+optimizer.lr=0.1", "write optimizer.lr=0.1"),
     ("~optimizer.lr", "~optimizer.lr", "needed"),
-    ("~optimizer", "~optimizer", "adam, adamw, rmsprop"),
+    ("~optimizer", "~optimizer", "needed; write optimizer=VALUE"),
     ("~env.size", "~env.size", "needed"),
     ("~phase.single", "phase", "at least one phase"),
     ("phase=two_phase ~phase.first.lr", "phase.first.lr", "missing"),
@@ -203,7 +202,6 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("sämpler=uniform", "sämpler=uniform", "quotes"),
     ("seed=☃", "seed=☃", "quotes"),
     ("seed='☃'", "seed=", "valid integer"),
-    ("+experiment=fast", "+experiment=fast", "write experiment=fast"),
     # other verbs
     ("query model=cnn", "model=cnn", "no such key"),
     ("evaluate model=1", "model=1", "no such key"),
@@ -265,9 +263,9 @@ def test_a_sweep_that_cannot_be_is_one_line(line: str, reason: str) -> None:
         check("config", Config, ["-m", *line.split()])
 
 
-@pytest.mark.parametrize("line", ["seed=1 seed=2", "model=cnn model=resnet", "-m seed=0,1 seed=2", "seed=1 +seed=2"])
+@pytest.mark.parametrize("line", ["seed=1 seed=2", "model=cnn model=resnet", "-m seed=0,1 seed=2", "+seed=1 ++seed=2"])
 def test_a_key_given_twice_is_refused(line: str) -> None:
-    *_, first, second = line.split()
+    *_, first, second = (word.lstrip("+") for word in line.split())
     with pytest.raises(ConfigError, match=f"^{re.escape(second)}: {re.escape(first)} says something else"):
         refuse_twice(line.split())
     refuse_twice([first, first])
@@ -283,6 +281,7 @@ def test_a_key_given_twice_is_refused(line: str) -> None:
         "phase=two_phase ~phase.second",
         "optimizer.lr=1",
         "++optimizer.lr=1e-4",
+        "+optimizer.lr=1e-4 +model=resnet",
         "sampler@samplers.uniform=uniform",
         "env.frameskip=4 env.crop=[0,160,210,0] --cfg job --resolve",
         "paths.outputs='/tmp/ü und ü'",

@@ -22,7 +22,7 @@ from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal, read_commit
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.launchers import BASIC, Launcher
-from atlantis_exp.sessions.launchers.joblib import shared, train_apart, train_side_by_side
+from atlantis_exp.sessions.launchers.joblib import shared, train_side_by_side
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.training import train
 from atlantis_exp.sessions.verifying import fingerprints
@@ -120,16 +120,25 @@ def test_jobs_that_are_left_share_the_cores_of_the_machine(
     assert shared(8, n_jobs, jobs) == (at_once, share)
 
 
+class FakeProcess:
+    """A process that ends at once."""
+
+    code = 0
+
+    def wait(self) -> int:
+        return self.code
+
+
 def test_jobs_side_by_side_are_told_their_share_unless_a_person_has_said_one(
     tiny: Compose, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[tuple[str, str]] = []
 
-    def ends(command: list[str], env: dict[str, str], **_: object) -> "subprocess.CompletedProcess[bytes]":
-        told.append((env["OMP_NUM_THREADS"], env["ATLANTIS_EXP_JOB_OF"]))
-        return subprocess.CompletedProcess(command, 0)
+    class Ends(FakeProcess):
+        def __init__(self, _: list[str], env: dict[str, str], **__: object) -> None:
+            told.append((env["OMP_NUM_THREADS"], env["ATLANTIS_EXP_JOB_OF"]))
 
-    monkeypatch.setattr(subprocess, "run", ends)
+    monkeypatch.setattr(subprocess, "Popen", Ends)
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
     jobs = [Job(tiny(f"seed={seed}")) for seed in range(2)]
@@ -196,13 +205,14 @@ def test_a_job_whose_process_dies_after_its_run_has_ended_is_not_marked(
 ) -> None:
     job = Job(tiny())
 
-    def ends(command: list[str], **_: object) -> "subprocess.CompletedProcess[bytes]":
-        recorded()
-        return subprocess.CompletedProcess(command, code)
+    class Dies(FakeProcess):
+        def __init__(self, *_: object, **__: object) -> None:
+            recorded()
+            self.code = code
 
-    monkeypatch.setattr(subprocess, "run", ends)
+    monkeypatch.setattr(subprocess, "Popen", Dies)
     with pytest.raises(Fault, match=RunFolder.of(job.config).name):
-        train_apart(job, os.environ)
+        train_side_by_side([job], Launcher("joblib", {"n_jobs": 1}))
     assert RunFolder.of(job.config).state == "done"
 
 

@@ -88,16 +88,12 @@ def test_the_end_of_the_time_or_of_the_sweep_is_a_fault_so_that_other_jobs_go_on
 def test_a_job_goes_on_while_the_process_that_launched_it_wants_it(tmp_path: Path) -> None:
     run, sweep = RunFolder(tmp_path / "runs" / "run"), RunFolder(tmp_path / "sweeps" / "sweep")
     assert sweep_goes_on(run, "joblib")()  # of no sweep
-    journal = Journal(sweep.path)
+    Journal(sweep.path)
     adopt(run.path, sweep.path)
 
     def wanted() -> dict[str | None, bool]:
-        return {launcher: sweep_goes_on(run, launcher)() for launcher in ("joblib", "apart", "slurm", None)}
+        return {launcher: sweep_goes_on(run, launcher)() for launcher in ("joblib", "slurm", None)}
 
-    journal.status("RUNNING")
     with sweep.held():
-        assert wanted() == {"joblib": True, "apart": True, "slurm": True, None: True}
-        journal.status("KILLED")
-        assert wanted() == {"joblib": False, "apart": False, "slurm": True, None: True}
-    journal.status("RUNNING")  # of a process that was killed before it could say so
-    assert wanted() == {"joblib": False, "apart": False, "slurm": True, None: True}
+        assert wanted() == {"joblib": True, "slurm": True, None: True}
+    assert wanted() == {"joblib": False, "slurm": True, None: True}

@@ -4,8 +4,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -19,39 +18,32 @@ from atlantis_exp.runs.folder import OUTPUT, RunFolder
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.launchers import Launcher
-from atlantis_exp.sessions.stopping import sweep_goes_on
-
-_STOP_SECONDS = 300.0  # that jobs have to commit once their sweep ends
 
 
-@contextmanager
-def committed_at_the_end(
-    journal: Journal, folders: Sequence[RunFolder], close_page: Callable[[], None]
-) -> Iterator[None]:
-    """Have all jobs commit before the sweep ends; after SIGINT or SIGTERM its exit code is a run's."""
-    own = [folder for folder in folders if not folder.is_held]
+class _Running:
+    """The processes of the jobs under way, which SIGINT and SIGTERM of the sweep have commit and end."""
 
-    def stop() -> None:
-        close_page()  # it writes the journal, too
-        patience = time.monotonic() + _STOP_SECONDS
-        if any(folder.is_held for folder in own):
-            journal.status("KILLED")  # the jobs look at it
-            while any(folder.is_held for folder in own) and time.monotonic() < patience:
-                time.sleep(0.2)
+    def __init__(self, environment: Mapping[str, str]) -> None:
+        self.environment = environment
+        self.has_ended = False
+        self.processes: set[subprocess.Popen[str]] = set()
 
-    def end(number: int, _: FrameType | None) -> NoReturn:
-        signal.signal(number, signal.SIG_DFL)  # a second one ends the process at once
-        terminal.warn(f"{signal.Signals(number).name}: the jobs commit and end")
-        stop()
-        sys.exit(128 + number)
+    @contextmanager
+    def ended_by_signals(self) -> Iterator[None]:
+        def end(number: int, _: FrameType | None) -> NoReturn:
+            signal.signal(number, signal.SIG_DFL)  # a second one ends this process at once
+            self.has_ended = True
+            terminal.warn(f"{signal.Signals(number).name}: the jobs commit and end")
+            for process in [*self.processes]:
+                process.terminate()
+            sys.exit(128 + number)
 
-    handlers = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        stop()
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+        handlers = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
 
 
 def train_side_by_side(jobs: Sequence[Job], launcher: Launcher) -> None:
@@ -62,9 +54,9 @@ def train_side_by_side(jobs: Sequence[Job], launcher: Launcher) -> None:
     """
     at_once, share = shared(all_cores(), launcher.settings["n_jobs"], jobs)
     # A person's own number of threads goes before.
-    environment = {"OMP_NUM_THREADS": f"{share}", "MKL_NUM_THREADS": f"{share}", **os.environ}
-    with ThreadPoolExecutor(at_once, "job") as pool:
-        futures = [pool.submit(train_apart, job, environment) for job in jobs]
+    running = _Running({"OMP_NUM_THREADS": f"{share}", "MKL_NUM_THREADS": f"{share}", **os.environ, JOB_OF: "joblib"})
+    with running.ended_by_signals(), ThreadPoolExecutor(at_once, "job") as pool:
+        futures = [pool.submit(_train_apart, job, running) for job in jobs]
         try:
             wait(futures)
         except BaseException:
@@ -84,24 +76,25 @@ def shared(cores: int, n_jobs: int, jobs: Sequence[Job]) -> tuple[int, int]:
     return at_once, max(cores // at_once, 1)
 
 
-def train_apart(job: Job, environment: Mapping[str, str]) -> None:
+def _train_apart(job: Job, running: _Running) -> None:
     """Train in a process of its own. Raises: Fault where the run fails."""
     config, folder = job.config, RunFolder.of(job.config)
     if folder.ended(config.budget.steps) is not None:
         return
-    if not sweep_goes_on(folder, "joblib")():
-        raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
     make_folder(folder.path)
     with open(folder.path / OUTPUT, "a+", opener=no_link) as output:
         start = output.tell()
-        code = subprocess.run(
-            [sys.executable, "-m", "atlantis_exp", "train", *job.overrides],
-            env={**environment, JOB_OF: "joblib"},
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=output,
-            check=False,
-        ).returncode
+        if running.has_ended:
+            raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
+        command = [sys.executable, "-m", "atlantis_exp", "train", *job.overrides]
+        process = subprocess.Popen(
+            command, env=running.environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output, text=True
+        )
+        running.processes.add(process)
+        if running.has_ended:  # meanwhile
+            process.terminate()
+        code = process.wait()
+        running.processes.discard(process)
         output.seek(start)
         said = output.read().splitlines()
     if code == 0:
