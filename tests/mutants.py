@@ -125,13 +125,15 @@ def mutants_of(tree: ast.AST, function: ast.AST | None = None) -> Iterator[Mutan
             if field in UNREAD or not isinstance(node, ast.AST):
                 continue
             inside = function or (node if isinstance(node, ast.FunctionDef) else None)
-            for new in changed(node, inside is not None) if hasattr(node, "lineno") else ():
+            for new in changed(node, inside is not None) if isinstance(node, ast.stmt | ast.expr) else ():
                 before, after = ast.unparse(node).split("\n"), ast.unparse(new).split("\n")
                 change = f"{before[0]} -> {'' if isinstance(new, ast.Pass) else after[0]}".rstrip()
                 lines = (0, 10**9)
                 if isinstance(inside, ast.FunctionDef):
                     lines = min([inside, *inside.decorator_list], key=lambda n: n.lineno).lineno, inside.end_lineno or 0
-                yield Mutant((tree, field, index), ast.copy_location(new, node), change, node.lineno, *lines)
+                yield Mutant(
+                    (tree, field, index), ast.copy_location(new, node), change, getattr(node, "lineno", 0), *lines
+                )
             yield from mutants_of(node, inside)
 
 
@@ -152,11 +154,11 @@ class Watch:
                 lines.add(frame.f_code.co_firstlineno)
 
         began = time.monotonic()
-        threading.settrace(trace)  # type: ignore[arg-type]
-        sys.settrace(trace)  # type: ignore[arg-type]
+        threading.settrace(trace)
+        sys.settrace(trace)
         yield
         sys.settrace(None)
-        threading.settrace(None)  # type: ignore[arg-type]
+        threading.settrace(None)
         self.seconds[item.nodeid], self.called[item.nodeid] = time.monotonic() - began, sorted(lines)
 
 

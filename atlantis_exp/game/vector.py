@@ -162,7 +162,7 @@ class ProcessEmulators(Emulators):
     end when it does. Waiting for one that has ended or hangs raises WorkerDied, once the others are ended too.
     """
 
-    patience = 60  # seconds that a worker may neither answer nor use the processor
+    patience = 60.0  # seconds that a worker may neither answer nor use the processor
 
     def __init__(self, make: Callable[[], Emulator], num_envs: int, workers: int) -> None:
         row = _row(first := make())  # and what `make` raises, it raises here

@@ -19,9 +19,8 @@ from rich.console import Console
 from atlantis_exp import terminal
 from atlantis_exp.build import build_trainer
 from atlantis_exp.checking import digest, flatten, to_dict
-from atlantis_exp.comparison.comparing import compare
+from atlantis_exp.comparison.choosing import mixed_protocol, resolve, shortened, values_in
 from atlantis_exp.comparison.decision import detectable, equivalence, looks_up_to
-from atlantis_exp.comparison.gather import mixed_protocol, resolve, shortened, values_in
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.comparison.tables import Comparison
 from atlantis_exp.comparison.verdict import Group, Question, families, wanted
@@ -30,6 +29,7 @@ from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal, Tracker
+from atlantis_exp.sessions.comparing import Choice, compare
 from atlantis_exp.sessions.job import Job, command_line, labels, quoted, replaced
 from atlantis_exp.sessions.page import opened, terminable
 from atlantis_exp.sessions.processor import set_up_torch
@@ -172,16 +172,8 @@ class Contest:
         self.folder.write_config({"command": self.command, "runs": ended})
         if any(self.left(label, range(self.looks[0])) for label in self.contenders):
             return None
-        return compare(
-            self.question,
-            runs=[self.folder.name],
-            where=(),
-            at_epsilon=self.config.evaluation.epsilon,
-            look_now=False,
-            tracking=self.config.tracking,
-            paths=self.config.paths,
-            command=self.comparing,
-        )
+        choice = Choice(self.outputs, [self.folder.name], at_epsilon=self.config.evaluation.epsilon)
+        return compare(self.question, choice, self.config.tracking, self.comparing)
 
     def needed(self, comparison: Comparison | None) -> dict[str, list[int]]:
         """Return the seeds that each contender lacks for its next look; empty once there is none.

@@ -15,7 +15,8 @@ import torch
 import yaml
 
 from atlantis_exp.build import build_network
-from atlantis_exp.comparison.gather import gather, group, plays_alike
+from atlantis_exp.comparison.choosing import group, plays_alike
+from atlantis_exp.comparison.gather import gather
 from atlantis_exp.comparison.tables import compare
 from atlantis_exp.comparison.verdict import Question
 from atlantis_exp.config import Config
