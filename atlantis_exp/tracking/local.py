@@ -33,6 +33,14 @@ _PLACES = (  # what names a file by its whole address
 )
 
 
+def forget_connections(root: Path) -> None:
+    """Close MLflow's connections to a database: they would go on using a file that was moved away."""
+    from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
+
+    if (engine := SqlAlchemyStore._engine_map.pop(uri_of(root), None)) is not None:
+        engine.dispose()
+
+
 def make_database(root: Path) -> None:
     """Make the database of an outputs folder if there is none, and let it be read while it is written."""
     from mlflow import MlflowClient

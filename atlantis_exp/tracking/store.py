@@ -193,6 +193,7 @@ class Store:
                     _log.warning("%s was moved or copied from %s: its MLflow store follows", self._root, before)
                 return client, self._opened_experiment(client)
             except Exception as error:
+                local.forget_connections(self._root)
                 raise self.explained(error) from None
 
     def _opened_experiment(self, client: "MlflowClient") -> str:
