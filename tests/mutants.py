@@ -130,7 +130,7 @@ def mutants_of(tree: ast.AST, function: ast.AST | None = None) -> Iterator[Mutan
                 change = f"{before[0]} -> {'' if isinstance(new, ast.Pass) else after[0]}".rstrip()
                 lines = (0, 10**9)
                 if isinstance(inside, ast.FunctionDef):
-                    first = min(each.lineno for each in (inside, *inside.decorator_list))
+                    first = min([inside.lineno, *(each.lineno for each in inside.decorator_list)])
                     lines = first, inside.end_lineno or 0
                 yield Mutant(
                     (tree, field, index), ast.copy_location(new, node), change, getattr(node, "lineno", 0), *lines
