@@ -8,6 +8,7 @@ import shutil
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
+from operator import itemgetter
 from pathlib import Path
 from urllib.parse import quote, urlsplit
 from urllib.request import url2pathname
@@ -98,7 +99,7 @@ def log_points(root: Path, run_id: str, points: Sequence[Point]) -> None:
         (key, 0.0 if math.isnan(value) else value, time, step, math.isnan(value), run_id)
         for key, value, time, step in points
     ]
-    latest = {row[0]: row for row in sorted(rows, key=lambda row: (row[3], row[2], row[1]))}
+    latest = {row[0]: row for row in sorted(rows, key=itemgetter(3, 2, 1))}
     with closing(sqlite3.connect(root / DATABASE)) as database, database:
         database.executemany(_METRIC, rows)
         database.executemany(_LATEST, latest.values())

@@ -119,14 +119,14 @@ def _publish(folder: Path, store: Store, commit: Commit, note: Path, is_primary:
     mirror = _Mirror(folder, store, run)
     for offset, record in read(folder, cursor.offset, commit.offset):
         mirror.send(record)
-        if len(mirror.points) >= _POINTS or offset == commit.offset:
+        if len(mirror.points) >= _POINTS:
             mirror.flush()
             cursor = replace(cursor, offset=offset)
             cursor.save(note)
     if mirror.gone:
         _log.warning("%s: %d files are gone and not published, such as %s", folder, len(mirror.gone), mirror.gone[0])
     mirror.send_state(commit, _parent_run(folder, store, commit, is_primary))
-    replace(cursor, commit=digest(commit)).save(note)
+    replace(cursor, offset=commit.offset, commit=digest(commit)).save(note)
     return True
 
 
@@ -212,13 +212,17 @@ class _Mirror:
         self.points: list[Point] = []
         self.gone: list[str] = []
         self._tags: dict[str, str] = {}
+        self._known = {**run.data.tags}
+        self._final = {**run.data.params}
 
     def flush(self) -> None:
         from mlflow.entities import RunTag
 
         self._store.log_points(self._run_id, self.points)
-        tags = [RunTag(key, value) for key, value in self._tags.items()]
+        new = {key: value for key, value in self._tags.items() if self._known.get(key) != value}
+        tags = [RunTag(key, value) for key, value in new.items()]
         self._client.log_batch(self._run_id, tags=tags, synchronous=True)
+        self._known |= new
         self.points.clear()
         self._tags.clear()
 
@@ -234,7 +238,7 @@ class _Mirror:
             self._tags["error"] = commit.error
             if (self._folder / TRACEBACK).exists():
                 self._store.put(self._run_id, TRACEBACK, read_file(self._folder / TRACEBACK, SMALL))
-        elif "error" in self._run.data.tags:
+        elif "error" in self._known:
             self._client.delete_tag(self._run_id, "error")
         self.flush()
 
@@ -271,10 +275,10 @@ class _Mirror:
         from mlflow.entities import Param
 
         values = {key: value[:_PARAM_LENGTH] for key, value in values.items()}
-        final = self._client.get_run(self._run_id).data.params
-        params = [Param(key, value) for key, value in values.items() if key not in final]
+        params = [Param(key, value) for key, value in values.items() if key not in self._final]
         self._client.log_batch(self._run_id, params=params, synchronous=True)
-        self._tags |= {key: value for key, value in values.items() if final.get(key, value) != value}
+        self._final = values | self._final
+        self._tags |= {key: value for key, value in values.items() if self._final[key] != value}
 
     def _send_image(self, record: Image, content: bytes) -> None:
         # `log_image` with a key would name the files at random, so that an image sent again would be a second one.

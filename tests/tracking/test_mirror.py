@@ -11,12 +11,15 @@ from typing import Any, NoReturn
 import PIL.Image
 import pytest
 
+from atlantis_exp.config import Config
 from atlantis_exp.runs.folder import TRACEBACK
 from atlantis_exp.runs.journal import Commit, Journal, Metrics, adopt, commit_bytes, read, read_commit
 from atlantis_exp.tracking.local import Point
 from atlantis_exp.tracking.mirror import publish
 from atlantis_exp.tracking.publishing import unfinished
 from atlantis_exp.tracking.store import Store
+from atlantis_exp.training.checkpoint import Checkpoints
+from atlantis_exp.training.trainer import Trainer
 from tests.tracking.folders import (
     a_full_journal,
     commit,
@@ -43,6 +46,31 @@ def test_mlflow_shows_what_is_committed_and_no_more(tmp_path: Path, root: Path, 
     journal.commit()
     publish(tmp_path, store)
     assert [point[1] for point in points(root, tmp_path)] == [1, 2]
+
+
+def test_metrics_whose_checkpoint_could_not_be_written_are_not_shown(
+    tmp_path: Path,
+    root: Path,
+    store: Store,
+    tiny: Callable[..., Config],
+    started: Callable[[Config, Path], Trainer],
+) -> None:
+    class FullDisk(Checkpoints):
+        def save(self, *_: object) -> NoReturn:
+            raise OSError("no space")
+
+    trainer = started(tiny(), tmp_path)
+    trainer.recorder.tracker.status("RUNNING")
+    trainer.recorder.tracker.metrics({"score": 1.0}, 1)
+    trainer.checkpoints = FullDisk(tmp_path / "checkpoints", "x")
+    with pytest.raises(OSError, match="no space"):
+        trainer.run(stop=lambda: True)
+    publish(tmp_path, store)
+    assert points(root, tmp_path) == []
+    trainer.checkpoints = Checkpoints(tmp_path / "checkpoints", "x")
+    trainer.commit()
+    publish(tmp_path, store)
+    assert [point[:2] for point in points(root, tmp_path)] == [("score", 1)]
 
 
 def test_a_folder_is_mirrored_whole(tmp_path: Path, root: Path, store: Store) -> None:
