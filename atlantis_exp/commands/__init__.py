@@ -8,6 +8,8 @@ import importlib
 import sys
 from pathlib import Path
 
+from atlantis_exp import interrupts
+
 VERBS = {
     "train": "train one network; the same command again continues or reports it",
     "decide": "train the seeds that a question needs until it is answered: model=cnn,resnet_fast",
@@ -36,6 +38,21 @@ CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else CHECKOUT / "conf"
 
 def main() -> None:
     """Run the verb that the command line names first; only its own module is imported."""
+    interrupts.listen()
+    try:
+        _run()
+    except Exception:
+        if not interrupts.seen():
+            raise
+    except KeyboardInterrupt:  # before there is anything to lose, or a verb would have said so
+        pass
+    else:
+        return
+    print("atlantis_exp: interrupted", file=sys.stderr)
+    sys.exit(130)  # 128 + SIGINT
+
+
+def _run() -> None:
     first, *rest = sys.argv[1:] or [""]
     if first in VERBS:
         verb, arguments = first, rest
@@ -58,8 +75,4 @@ def main() -> None:
 
         print(f"atlantis-exp {version('atlantis-exp')}")
         sys.exit(0)
-    try:
-        importlib.import_module(f"atlantis_exp.commands.{verb.replace('-', '_')}").VERB.run(arguments)
-    except KeyboardInterrupt:  # before there is anything to lose, or a verb would have said so
-        print("atlantis_exp: interrupted", file=sys.stderr)
-        sys.exit(130)  # 128 + SIGINT
+    importlib.import_module(f"atlantis_exp.commands.{verb.replace('-', '_')}").VERB.run(arguments)

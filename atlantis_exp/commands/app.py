@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-from atlantis_exp import terminal
+from atlantis_exp import interrupts, terminal
 from atlantis_exp.commands.composing import admit
 from atlantis_exp.commands.overrides import check, flags_of, launcher, located, refuse_twice, shown
 from atlantis_exp.faults import ConfigError, Fault, remedied
@@ -62,6 +62,8 @@ class Verb(Generic[T]):
             elif not flags.multirun:
                 with terminal.working(f"{self.name}: loading"):
                     call = self.work(asked[0])
+                if interrupts.seen():
+                    raise KeyboardInterrupt
                 call()
             elif self.sweep is not None:
                 self.sweep(asked, launcher(arguments), arguments)

@@ -22,6 +22,7 @@ from atlantis_exp.commands.overrides import (
     refuse_twice,
     swept,
     values_of,
+    with_first_values,
 )
 from atlantis_exp.config import FREE, STRICT, Config
 from atlantis_exp.faults import ConfigError
@@ -63,7 +64,7 @@ def _launchers(texts: Iterable[str]) -> list[str]:
 
 
 def _first_contender(arguments: list[str]) -> list[str]:
-    """Leave out the keys that tell contenders apart, and the launcher: what they share is composed, and run here."""
+    """Take the first contender without the launcher: its config, which the others share, is composed and run here."""
     texts, is_sweep = read_flags(arguments := _as_texts(arguments))
     if is_sweep:
         raise ConfigError("-m: decide plans its own sweeps; drop -m")
@@ -74,8 +75,8 @@ def _first_contender(arguments: list[str]) -> list[str]:
             raise ConfigError(f"{text}: decide trains seeds from 0 on, as many as it needs; drop it")
         if override.key_or_group == "resume" and override.value() != "auto":
             raise ConfigError(f"{text}: decide goes on with the runs that are there; drop it")
-    dropped = (*swept(arguments), *_launchers(texts))
-    return [argument for argument in arguments if argument not in dropped]
+    dropped = _launchers(texts)
+    return with_first_values([argument for argument in arguments if argument not in dropped])
 
 
 def _work(asked: Asked[DecideConfig]) -> Callable[[], None]:

@@ -13,7 +13,7 @@ from typing import NoReturn, TypeVar
 
 from hydra import compose
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, RangeSweep
+from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
@@ -267,6 +267,22 @@ def values_of(override: Override) -> list[str]:
     if not values:
         raise ConfigError(f"{override.input_line}: there is no value in it")
     return values
+
+
+def with_first_values(arguments: Sequence[str]) -> list[str]:
+    """Return arguments with the first of the values that a key is given, which others may need to be valid.
+
+    Raises:
+        ConfigError: where there are none.
+    """
+    several = swept(arguments)
+    return [_first_value(text) if text.lstrip("+") in several else text for text in arguments]
+
+
+def _first_value(text: str) -> str:
+    value = read_override(text).value()
+    first = value.start if isinstance(value, IntervalSweep) else values_of(read_override(text))[0]
+    return f"{text.split('=', 1)[0]}={first}"
 
 
 def is_longer(values: RangeSweep, most: int) -> bool:

@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.jobs import training_of
-from atlantis_exp.commands.overrides import refuse_twice, swept
+from atlantis_exp.commands.overrides import key_of, refuse_twice, swept, with_first_values
 from atlantis_exp.components import Count
 from atlantis_exp.config import FREE, STRICT, Config
 from atlantis_exp.faults import ConfigError, Fault
@@ -55,13 +55,12 @@ CLOSED = _OWN | FREE | {"seed", "evaluation"}
 """What no searched key may begin with."""
 
 
-def _without_searched(arguments: list[str]) -> list[str]:
-    """Leave out the keys that are given several values, which are those to search."""
+def _first_trial(arguments: list[str]) -> list[str]:
+    """Take the first of the values that a key is to be searched among."""
     if {"-m", "--multirun"} & set(arguments):
         raise ConfigError("-m: a search is no sweep, it tries one set of values after the other; drop -m")
     refuse_twice([argument.removeprefix("space.") for argument in arguments])
-    searched = swept(arguments)
-    return [argument for argument in arguments if argument not in searched]
+    return with_first_values(arguments)
 
 
 def _work(asked: Asked[SearchConfig]) -> Callable[[], None]:
@@ -81,8 +80,10 @@ def search_of(asked: Asked[SearchConfig]) -> "Search":
     texts = config.space | dict(text.removeprefix("space.").split("=", 1) for text in searched)
     if not texts:
         raise ConfigError("nothing to search: give a key several values, as in optimizer=adam,rmsprop")
-    own = [text for text in asked.overrides if text.lstrip("+~").split("=")[0].split(".")[0] in _OWN]
-    overrides = replaced([text for text in asked.overrides if text not in own], f"seed={config.seed}")
+    keys = {key_of(text) for text in searched}
+    fixed = [text for text in asked.overrides if key_of(text) not in keys]
+    own = [text for text in fixed if text.lstrip("+~").split("=")[0].split(".")[0] in _OWN]
+    overrides = replaced([text for text in fixed if text not in own], f"seed={config.seed}")
     space = read_space(texts, CLOSED)
     return Search(
         space=space,
@@ -96,8 +97,8 @@ def search_of(asked: Asked[SearchConfig]) -> "Search":
         startup=config.startup,
         pruned_after=config.pruning.trials,
         spared=config.pruning.evaluations,
-        command=command_line("search", *asked.overrides, *searched),
+        command=command_line("search", *fixed, *searched),
     )
 
 
-VERB = Verb("search", SearchConfig, _work, rewrite=_without_searched)
+VERB = Verb("search", SearchConfig, _work, rewrite=_first_trial)

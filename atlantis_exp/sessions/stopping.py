@@ -9,7 +9,7 @@ from math import inf
 from types import FrameType
 from typing import Any, NoReturn
 
-from atlantis_exp import terminal
+from atlantis_exp import interrupts, terminal
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder
 
@@ -18,6 +18,8 @@ _LOOK_SECONDS = 1.0  # between two looks at whether the sweep goes on
 
 class StopRequest:
     """Turns the first SIGINT, SIGTERM or SIGUSR2, or the end of the time, into a flag that the trainer looks at.
+
+    The time begins with the first look, after the first step: a session whose set-up takes longer makes progress, too.
 
     So does the end of the sweep that the run is a job of, as `sweep_goes_on` tells it. A second SIGINT ends the process
     at once; what was committed stays. Under Slurm SIGTERM is a warning: the run is committed and goes on, since Slurm
@@ -33,7 +35,8 @@ class StopRequest:
         self.signal: int | None = None
         self._under_slurm = under_slurm
         self._is_warned = False  # by Slurm
-        self._deadline = inf if seconds is None else time.monotonic() + seconds
+        self._seconds = seconds
+        self._deadline = inf
         self._sweep_goes_on = sweep_goes_on
         self._sweep_has_ended = False
         self._looked = 0.0  # time
@@ -41,6 +44,8 @@ class StopRequest:
 
     def __call__(self) -> bool:
         now = time.monotonic()
+        if self._seconds is not None and self._deadline == inf:  # the first step is made: set-up is no part of the time
+            self._deadline = now + self._seconds
         if now - self._looked >= _LOOK_SECONDS:
             self._looked = now
             self._sweep_has_ended = self._sweep_has_ended or not self._sweep_goes_on()
@@ -67,6 +72,8 @@ class StopRequest:
         """Listen while the block runs."""
         signals = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
         self._before = {number: signal.signal(number, self._receive) for number in signals}
+        if interrupts.seen():  # and swallowed
+            self.signal = signal.SIGINT
         try:
             yield
         finally:

@@ -1,9 +1,12 @@
 """The edge: exit codes, what is printed where, and what a command line may leave behind."""
 
 import os
+import random
 import re
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +18,7 @@ from atlantis_exp.commands import VERBS
 from atlantis_exp.commands.composing import checked
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.config import Config
+from atlantis_exp.sessions.job import replaced
 
 REPOSITORY = Path(__file__).parents[2]
 Command = Callable[..., int]
@@ -123,6 +127,41 @@ def test_nothing_heavy_is_loaded_before_the_config_is_checked() -> None:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     heavy = {"torch", "mlflow", "ale_py", "gymnasium", "cv2", "matplotlib", "scipy", "av", "numpy"}
     assert heavy & set(done.stdout.split()) == set()
+
+
+@pytest.mark.parametrize(
+    "moments", [pytest.param(4, id="few"), pytest.param(300, marks=(pytest.mark.slow, pytest.mark.timeout(6_000)))]
+)
+def test_an_interrupt_at_any_moment_of_the_start_ends_a_training(
+    tiny_overrides: tuple[str, ...], tmp_path: Path, moments: int
+) -> None:
+    """Some libraries swallow a KeyboardInterrupt, as pydantic does where it builds a schema."""
+    program = "from atlantis_exp.commands import main; print('up', flush=True); main()"
+    words = replaced(tiny_overrides, "phase.quick.steps=100_000")
+    rng, longest = random.Random(0), 0.0
+    for moment in range(-1, moments):
+        training = subprocess.Popen(
+            (sys.executable, "-c", program, *words, f"paths.outputs={tmp_path / str(moment)}"),
+            cwd=REPOSITORY,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert training.stdout is not None
+        assert training.stdout.readline() == "up\n"
+        began = time.monotonic()
+        if moment < 0:  # how long a start takes here
+            while not training.stdout.readline().startswith("starting run"):
+                assert training.poll() is None
+            longest = time.monotonic() - began
+        else:
+            time.sleep(rng.uniform(0, longest))
+        training.send_signal(signal.SIGINT)
+        _, error = training.communicate(timeout=120)
+        assert training.returncode in (130, -signal.SIGINT), error  # the latter before there is a handler
+        if training.returncode == 130:
+            assert "Traceback" not in error
+            assert re.search("atlantis_exp: (interrupted|SIGINT: run .* is committed)", error)
 
 
 def test_an_interrupt_while_a_verb_is_imported_is_one_line(

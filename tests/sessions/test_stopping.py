@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -83,6 +84,15 @@ def test_the_end_of_the_time_or_of_the_sweep_is_a_fault_so_that_other_jobs_go_on
         out_of_sweep.end("committed")
     assert fault.value.exit_code == 143
     assert not StopRequest(60, lambda: True)()
+
+
+def test_the_time_begins_with_the_first_step_so_that_a_long_set_up_does_not_end_a_session_before_it() -> None:
+    stop = StopRequest(0.05)
+    with stop.installed():
+        time.sleep(0.1)  # the set-up
+        assert not stop()
+        time.sleep(0.1)
+        assert stop()
 
 
 def test_a_job_goes_on_while_the_process_that_launched_it_wants_it(tmp_path: Path) -> None:
