@@ -281,7 +281,7 @@ def test_breakout_and_pong_are_trained_continued_compared_exported_and_played_ag
     for id_, run in runs.items():
         assert run.result is not None
         assert run.result.steps == 2_000
-        shown = ("compare", "by=seed", f"where=env.id={id_}", "why=true", BOTH, "tracking=none", here)
+        shown = ("compare", "by=seed", f"where=env.id={id_}", BOTH, "tracking=none", here)
         assert command(*shown) == 0
         assert "needs plugins=./" in said("evaluate", f"run={run.name}", here, "tracking=none")
         to = tmp_path / run.config["env"]["id"].rpartition("/")[2]
@@ -294,5 +294,4 @@ def test_breakout_and_pong_are_trained_continued_compared_exported_and_played_ag
     assert len(pages) == 2
     for path in pages:
         page = re.sub(r"<[^>]*>", " ", path.read_text())
-        assert "There are no archived states of this game" in page
         assert {*facts_in(page)} == ({"RIGHTFIRE", "LEFTFIRE"} if "Atari Pong" in page else set())  # Pong's own, too

@@ -30,7 +30,6 @@ class CompareConfig:
     seeds: Annotated[int, Field(ge=5, le=10_000)]  # a group, at the last look
     error: Annotated[float, Field(gt=0, lt=1)]  # probability of any false verdict
     look: Literal["due", "now"]
-    why: bool  # also ask the networks themselves
     tracking: TrackingConfig
     paths: PathsConfig
 
@@ -60,7 +59,7 @@ def margin(delta: str | float | None) -> tuple[float | None, bool]:
     return value, text.endswith("%")
 
 
-def _list_out(arguments: list[str]) -> list[str]:
+def list_out(arguments: list[str]) -> list[str]:
     """Let a list be written without brackets, as in `by=model,sampler`."""
     # Hydra itself would take the commas for a sweep, and a second `=` for a mistake.
     return [re.sub(r"^(by|runs|where)=([^\[].*)$", _listed, argument) for argument in as_texts(arguments)]
@@ -77,25 +76,11 @@ def _listed(match: re.Match[str]) -> str:
 
 
 def _work(asked: Asked[CompareConfig]) -> Callable[[], object]:
-    from atlantis_exp.comparison.comparing import compare
+    from atlantis_exp.sessions.comparing import Choice, compare
 
-    config, probe = asked.config, None
-    if config.why:
-        from atlantis_exp.sessions.probing import probe_groups
-
-        probe = partial(probe_groups, Path(config.paths.outputs))
-    return partial(
-        compare,
-        config.question,
-        runs=config.runs,
-        where=config.where,
-        at_epsilon=config.at_epsilon,
-        look_now=config.look == "now",
-        tracking=config.tracking,
-        paths=config.paths,
-        command=asked.command,
-        probe=probe,
-    )
+    config = asked.config
+    choice = Choice(Path(config.paths.outputs), config.runs, config.where, config.at_epsilon)
+    return partial(compare, config.question, choice, config.tracking, asked.command, look_now=config.look == "now")
 
 
-VERB = Verb("compare", CompareConfig, _work, rewrite=_list_out)
+VERB = Verb("compare", CompareConfig, _work, rewrite=list_out)

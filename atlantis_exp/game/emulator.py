@@ -85,11 +85,6 @@ class Emulator:
         """As ALE counts them; in some games they can rise again."""
         return self._ale.lives()
 
-    @property
-    def screen(self) -> Pixels:
-        """A copy of the frame on screen, (210, 160) palette indices."""
-        return self._screen.copy()
-
     def screen_rgb(self) -> Pixels:
         """Returns the frame on screen in colour, (210, 160, 3) uint8."""
         return PALETTE.take(self._screen, axis=0)

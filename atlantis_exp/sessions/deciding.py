@@ -20,8 +20,7 @@ from rich.console import Console
 from atlantis_exp import terminal
 from atlantis_exp.build import build_trainer
 from atlantis_exp.checking import digest, flatten, to_dict
-from atlantis_exp.comparison.comparing import compare
-from atlantis_exp.comparison.gather import mixed_protocol, resolve, shortened, values_in
+from atlantis_exp.comparison.choosing import mixed_protocol, resolve, shortened, values_in
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.comparison.tables import Comparison
 from atlantis_exp.comparison.verdict import Family, Group, Question, families, wanted
@@ -32,6 +31,7 @@ from atlantis_exp.media import run_colour
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal, Metrics, NullJournal
 from atlantis_exp.runs.provenance import provenance
+from atlantis_exp.sessions.comparing import Choice, compare
 from atlantis_exp.sessions.job import Job, command_line, labels, quoted
 from atlantis_exp.sessions.sweep import ledger, terminable
 from atlantis_exp.sessions.training import expected, train
@@ -216,16 +216,8 @@ class _Session:
         self.folder.write_config({"command": self.request.command, "runs": ended})
         if not all(self.done(label, seed) for label in self.contenders for seed in range(self.looks[0])):
             return None
-        return compare(
-            self.request.question,
-            runs=[self.folder.name],
-            where=(),
-            at_epsilon=self.epsilon,
-            look_now=False,
-            tracking=self.tracking,
-            paths=self._first.config.paths,
-            command=self.comparing,
-        )
+        choice = Choice(self.outputs, [self.folder.name], at_epsilon=self.epsilon)
+        return compare(self.request.question, choice, self.tracking, self.comparing)
 
     def needed(self, comparison: Comparison | None) -> dict[str, list[int]]:
         """The seeds that each contender lacks for its next look; empty once there is none.

@@ -33,7 +33,7 @@ def export(
 ) -> None:
     """Play the network as it will be handed on, then write it with a card of how it was made and what it scored."""
     if onnx:
-        from atlantis_exp.sessions.onnx import export_onnx, require  # and scipy, a second that plain exports do without
+        from atlantis_exp.sessions.onnx import export_onnx, require
 
         require()
     outputs = Path(paths.outputs)
@@ -48,7 +48,7 @@ def export(
     actor = build_exported_actor(trained, packed, device)
     exported = None
     if onnx:
-        with terminal.working("writing the network as ONNX, and asking both about the same states"):
+        with terminal.working("writing the network as ONNX, and comparing it with torch"):
             exported = export_onnx(trained, packed)
     make_folder(folder)  # before the episodes, lest there be no place for their scores
     settings = replace(evaluation, video=False, num_envs=evaluation.at_once)

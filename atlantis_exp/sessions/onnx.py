@@ -1,8 +1,7 @@
-"""A network as ONNX, for whoever plays without torch, asked about the same states as the one in torch."""
+"""Export a network as ONNX, to play without torch, and compare its values with torch's."""
 
 import logging
 import warnings
-from dataclasses import replace
 from importlib.util import find_spec
 from typing import NamedTuple
 
@@ -14,11 +13,10 @@ from torch import nn
 from atlantis_exp.build import build_trained_network
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
-from atlantis_exp.game.archive import read_archive
 from atlantis_exp.learning.objectives import action_values
 from atlantis_exp.learning.values import ActionValues
-from atlantis_exp.sessions.probing import Network, Values, asked
 
+_STATES = 64  # drawn at random, on which both are compared
 _TOLERANCE = 1e-4  # of the largest value, between float32 in torch and in ONNX Runtime
 
 
@@ -26,12 +24,12 @@ class Exported(NamedTuple):
     """A network as ONNX, and how far its values are from torch's."""
 
     content: bytes
-    states: int
+    states: int  # compared
     difference: float  # the largest, in units of the values
 
 
 class _Values(nn.Module):
-    """What `ActionValues` computes: states (B, C, H, W) in 0..255 to the values of actions (B, A)."""
+    """Compute what `ActionValues` does: states (B, C, H, W) in 0..255 to the values of actions (B, A)."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
@@ -42,18 +40,16 @@ class _Values(nn.Module):
 
 
 def require() -> None:
-    """Raise ConfigError where what writes and asks ONNX is not installed."""
+    """Raise ConfigError if the extra `onnx` is not installed."""
     if not all(map(find_spec, ("onnx", "onnxscript", "onnxruntime"))):
         raise ConfigError("onnx=true: needs pip install 'atlantis-exp[onnx]'")
 
 
 def export_onnx(config: Config, weights: bytes) -> Exported:
-    """A trained network as ONNX: `states`, uint8 (batch, stack, size, size), to `q_values`, float32 (batch, actions).
-
-    It is asked about the game's archived states, or about noise where a game has none.
+    """Export a trained network: `states`, uint8 (batch, stack, size, size), to `q_values`, float32 (batch, actions).
 
     Raises:
-        Fault: where it cannot be written, or says something else than in torch.
+        Fault: if it cannot be written, or if its values differ from torch's.
     """
     network = build_trained_network(config, weights).eval()
     shape = config.env.stack, config.env.size, config.env.size
@@ -77,28 +73,17 @@ def export_onnx(config: Config, weights: bytes) -> Exported:
         raise Fault(f"the network cannot be written as ONNX: {str(error).splitlines()[0]}") from error
     finally:
         logging.disable(before)
-    here, there = _both(config, network, content)
+    states = np.random.default_rng(0).integers(0, 256, (_STATES, *shape), np.uint8)
+    here, there = ActionValues(network).q_values(states), _q_values(content, states)
     difference = float(np.abs(here - there).max())
     if not difference <= _TOLERANCE * max(1.0, float(np.abs(here).max())):
-        raise Fault(f"the network says something else as ONNX: its values are up to {difference:g} from torch's")
-    return Exported(content, len(here), difference)
+        raise Fault(f"the network's values as ONNX are up to {difference:g} from torch's")
+    return Exported(content, _STATES, difference)
 
 
-def _both(config: Config, network: nn.Module, content: bytes) -> tuple[Values, Values]:
-    """The values of torch and of ONNX Runtime in the same states."""
+def _q_values(content: bytes, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
     import onnxruntime
 
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-
-    def q_values(states: npt.NDArray[np.uint8]) -> Values:
-        values: Values = session.run(None, {"states": states})[0]
-        return values
-
-    plain = Network("torch", "torch", config.env, ActionValues(network).q_values)
-    other = replace(plain, run="ONNX Runtime", q_values=q_values)
-    if (game := config.env.game) is not None and (path := game.data_path("states.npz")).is_file():
-        archive = read_archive(path)
-        return asked(plain, archive), asked(other, archive)
-    size = (64, config.env.stack, config.env.size, config.env.size)
-    states = np.random.default_rng(0).integers(0, 256, size, np.uint8)
-    return plain.q_values(states), q_values(states)
+    values: npt.NDArray[np.float32] = session.run(None, {"states": states})[0]
+    return values

@@ -11,7 +11,8 @@ import pytest
 import safetensors.numpy
 import yaml
 
-from atlantis_exp.comparison.gather import gather, group, plays_alike
+from atlantis_exp.comparison.choosing import group, plays_alike
+from atlantis_exp.comparison.gather import gather
 from atlantis_exp.comparison.tables import compare
 from atlantis_exp.comparison.verdict import Question
 from atlantis_exp.config import Config
