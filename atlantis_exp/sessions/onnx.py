@@ -26,12 +26,12 @@ class Exported(NamedTuple):
     """A network as ONNX, and how far its values are from torch's."""
 
     content: bytes
-    states: int  # compared
+    states: int
     difference: float  # the largest, in units of the values
 
 
 class _Values(nn.Module):
-    """Compute what `ActionValues` does: states (B, C, H, W) in 0..255 to the values of actions (B, A)."""
+    """What `ActionValues` computes: states (B, C, H, W) in 0..255 to the values of actions (B, A)."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
@@ -42,7 +42,7 @@ class _Values(nn.Module):
 
 
 def require() -> None:
-    """Raise ConfigError if the extra `onnx` is not installed."""
+    """Raise ConfigError where what writes and asks ONNX is not installed."""
     if not all(map(find_spec, ("onnx", "onnxscript", "onnxruntime"))):
         raise ConfigError("onnx=true: needs pip install 'atlantis-exp[onnx]'")
 
@@ -78,12 +78,11 @@ def export_onnx(config: Config, weights: bytes) -> Exported:
         raise Fault(f"the network cannot be written as ONNX: {reason}") from error
     finally:
         logging.disable(before)
-    states = np.random.default_rng(0).integers(0, 256, (_STATES, *shape), np.uint8)
-    here, there = ActionValues(network).q_values(states), _q_values(content, states)
+    here, there = _both(config, network, content)
     difference = float(np.abs(here - there).max())
     if not difference <= _TOLERANCE * max(1.0, float(np.abs(here).max())):
-        raise Fault(f"the network's values as ONNX are up to {difference:g} from torch's")
-    return Exported(content, _STATES, difference)
+        raise Fault(f"the network says something else as ONNX: its values are up to {difference:g} from torch's")
+    return Exported(content, len(here), difference)
 
 
 def _both(config: Config, network: nn.Module, content: bytes) -> tuple[Values, Values]:
