@@ -331,6 +331,14 @@ def test_looks_are_taken_where_they_are_planned_and_the_same_seeds_charge_nothin
     assert widths[1] < widths[0]
 
 
+def test_where_a_look_decides_some_pairs_the_others_take_the_next_one_at_once_if_they_have_its_seeds() -> None:
+    runs = around("cnn", 1_000.0, range(10)) + around("other", 1_001.0, range(10)) + around("resnet", 9_000.0)
+    (each,) = compared(runs).answers
+    assert [look.size for look in each.decision.looks] == [5, 10]
+    assert each.taken is each.decision.looks[-1]
+    assert {verdict.said: verdict.seeds for verdict in each.decision.verdicts} == {"not decided": 10, "worse": 5}
+
+
 def test_a_look_that_nobody_planned_is_charged_and_said() -> None:
     runs = [*around("cnn", 3_000.0, range(7)), *around("resnet", 3_015.0, range(7))]
     first = compared([run for run in runs if run.config["seed"] < 5])
