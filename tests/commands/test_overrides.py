@@ -173,7 +173,7 @@ MISTAKES = [  # what is written, and what the one line must hold
             *("hydra.sweeper._target_=os.system", "hydra.callbacks.x._target_=os.system", "hydra/sweeper=basic"),
             *("hydra.job_logging.version=1", "hydra.searchpath=[file:///tmp]", "hydra.run.dir=/tmp/x"),
             *("hydra.output_subdir=x", "hydra.job.chdir=true", "hydra.verbose=[a,b]", "hydra.sweep.dir=/tmp/x"),
-            *("~hydra.launcher", "hydra.launcher={a:1}", "hydra={verbose:true}", "+hydra={a:1}", "hydra=basic"),
+            *("~hydra.launcher", "hydra.launcher={a:1}", "hydra={verbose:true}", "hydra={a:1}", "hydra=basic"),
             "hydra/launcher@hydra.job_logging=basic",
         )
     ),
