@@ -104,8 +104,8 @@ def test_an_experiment_whose_files_are_elsewhere_by_choice_keeps_them(
 ) -> None:
     mlflow_tables(tmp_path)
     client = Store(tmp_path).client
-    client.create_experiment("other", "file:///elsewhere")
-    assert Store(tmp_path).client.get_experiment_by_name("other").artifact_location == "file:///elsewhere"
+    other = client.create_experiment("other", "file:///elsewhere")
+    assert Store(tmp_path).client.get_experiment(other).artifact_location == "file:///elsewhere"
 
 
 def test_points_are_stored_as_mlflows_own_client_stores_them(store: Store, root: Path) -> None:
