@@ -14,9 +14,6 @@ from typing import TYPE_CHECKING, Any, cast
 from atlantis_exp.runs.journal import NOTE
 from atlantis_exp.tracking.local import uri_of
 
-if TYPE_CHECKING:
-    from fastapi import FastAPI
-
 _SECTIONS = {  # cards a row, and their height in pixels
     "evaluation": (2, 360),
     "score": (2, 360),
@@ -79,12 +76,10 @@ def address(server: str, experiment_id: str, view: str) -> str:
     )
 
 
-def site(outputs: Path, start: str) -> "FastAPI":
+def site(outputs: Path, start: str) -> Any:
     """Return MLflow's server on the store of an outputs folder, whose plain address leads to `start`."""
     os.environ["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] = "false"  # ten processes otherwise
-    from mlflow.server.constants import BACKEND_STORE_URI_ENV_VAR
-
-    os.environ[BACKEND_STORE_URI_ENV_VAR] = uri_of(outputs.resolve())  # before the next import, which reads it
+    os.environ["_MLFLOW_SERVER_FILE_STORE"] = uri_of(outputs.resolve())  # read by the import: this is a server
     from mlflow.server import app as pages
 
     with warnings.catch_warnings(action="ignore"):  # of a library that MLflow will replace
