@@ -232,6 +232,7 @@ def test_a_film_is_of_the_episodes_that_count(recorded: Recorded, tmp_path: Path
     assert gather(tmp_path).trainings[0].film is None  # nobody says of which evaluation it is
     for step, shown in ((80, None), (160, film)):
         journal = Journal(own.path)
+        journal.resume()
         journal.tags({"best_evaluation": f"mean 1 at step {step}"})
         journal.finish()
         assert gather(tmp_path).trainings[0].film == shown
