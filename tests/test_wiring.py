@@ -251,8 +251,8 @@ def test_what_was_trained_is_evaluated_compared_and_reported(
 
     assert command("report", place) == 0
     shown = capsys.readouterr().out
-    assert f"\n{first}\n" in shown
-    assert f"\n{second}\n" in shown
+    assert first in shown
+    assert second in shown
 
 
 def test_without_a_terminal_a_line_now_and_then_says_how_far_a_training_is(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -116,7 +116,7 @@ def test_a_held_button_scores_2000_and_the_run_holds_its_report_table_picture_an
     tables = {item.path for item in client.list_artifacts(run.info.run_id, "evaluation")}
     assert tables == {"evaluation/episodes.csv", "evaluation/report.txt"}
 
-    report(paths=config.paths)
+    report(Path(config.paths.outputs))
     table = capsys.readouterr().out
     assert run.info.run_name == f"constant 1 Atlantis-v0 {config.identity()[:6]}"
     assert name in table

@@ -152,7 +152,7 @@ def test_scores_of_an_evaluation_before_the_last_step_are_said_to_be(
     config = tiny("evaluation.at_end=false", "evaluation.every_steps=70")
     train(Job(config))
     assert "\nevaluated last at step 140 of 160 (evaluation.at_end=false):\n" in capsys.readouterr().out
-    report(paths=config.paths)
+    report(Path(config.paths.outputs))
     assert "160 (evaluated at 140)" in capsys.readouterr().out
 
 
