@@ -6,7 +6,6 @@ from pathlib import Path
 from rich.table import Table
 
 from atlantis_exp import terminal
-from atlantis_exp.config import PathsConfig
 from atlantis_exp.runs.folder import EVALUATED, TABLE_COLUMNS, RunFolder, all_runs
 from atlantis_exp.runs.journal import Metrics
 from atlantis_exp.tracking.publishing import catch_up, how_to_open

@@ -9,7 +9,7 @@ import os
 import warnings
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 from atlantis_exp.runs.journal import NOTE
 from atlantis_exp.tracking.local import uri_of
@@ -89,7 +89,7 @@ def site(outputs: Path, start: str) -> Any:
     lead = f"<head><script>if (!location.hash) location.replace({json.dumps(start)})</script>"
     index = Path(str(pages.static_folder), "index.html").read_text().replace("<head>", lead, 1)
     pages.view_functions["serve"] = lambda: index
-    return cast("FastAPI", app)
+    return app
 
 
 def _start_here() -> dict[str, Any]:
