@@ -40,7 +40,8 @@ def main() -> None:
     """Run the verb that the command line names first; only its own module is imported."""
     interrupts.listen()
     try:
-        _run()
+        verb, arguments = _asked()
+        importlib.import_module(f"atlantis_exp.commands.{verb.replace('-', '_')}").VERB.run(arguments)
     except Exception:
         if not interrupts.seen():
             raise
@@ -52,7 +53,8 @@ def main() -> None:
     sys.exit(130)  # 128 + SIGINT
 
 
-def _run() -> None:
+def _asked() -> tuple[str, list[str]]:
+    """Return the verb and its arguments; print help or the version instead, where that is asked for."""
     first, *rest = sys.argv[1:] or [""]
     if first in VERBS:
         verb, arguments = first, rest
@@ -75,4 +77,4 @@ def _run() -> None:
 
         print(f"atlantis-exp {version('atlantis-exp')}")
         sys.exit(0)
-    importlib.import_module(f"atlantis_exp.commands.{verb.replace('-', '_')}").VERB.run(arguments)
+    return verb, arguments
