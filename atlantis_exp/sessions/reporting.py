@@ -37,7 +37,7 @@ def report(outputs: Path, runs: Sequence[str] = (), where: Sequence[str] = ()) -
             table.add_row(run.name, f"{step:,} ({run.state})" if evaluation else run.state, *_cells(evaluation))
     console = terminal.console(least=150)
     console.print(table)
-    console.print(how_to_open(outputs), end="")
+    console.print(how_to_open(outputs), end="", soft_wrap=True)  # a command to copy
 
 
 def _chosen(outputs: Path, runs: Sequence[str], where: Sequence[str]) -> list[RunFolder]:
