@@ -59,7 +59,7 @@ def _as_texts(arguments: Iterable[str]) -> list[str]:
 
 
 def _launchers(texts: Iterable[str]) -> list[str]:
-    """The overrides that choose a launcher and set it up."""
+    """Return the overrides that choose a launcher and set it up."""
     return [text for text in texts if key_of(text).startswith(("hydra/launcher", "hydra.launcher."))]
 
 
@@ -101,10 +101,12 @@ def contest_of(asked: Asked[DecideConfig]) -> "Contest":
             raise ConfigError(f"{key}: says how contenders are trained or measured, not what they are; one value only")
         if key == "experiment":
             raise ConfigError(
-                "experiment: a preset is no single key; name those that differ, as in objective=dqn,quantile"
+                "experiment: a preset is not a single key; name those that differ, as in objective=dqn,quantile"
             )
         if several and (not override.is_discrete_sweep() or isinstance(override.value(), Glob)):
-            raise ConfigError(f"{override.input_line}: no list of values; write them out, as in model=cnn,resnet_fast")
+            raise ConfigError(
+                f"{override.input_line}: not a list of values; write them out, as in model=cnn,resnet_fast"
+            )
     contenders = [(), tuple(config.against)]
     if not config.against:
         choices = [

@@ -28,7 +28,7 @@ class PruningConfig:
     """When a trial is cut short: below the median of the others' at the same evaluation."""
 
     trials: Count | None  # that have ended before any is cut short; null: none ever is
-    evaluations: Annotated[int, Field(ge=0)]  # of its own that a trial is spared
+    evaluations: Annotated[int, Field(ge=0)]  # a trial's first ones, at which it is never cut short
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -52,13 +52,13 @@ class SearchConfig(Config):
 
 _OWN = {field.name for field in dataclasses.fields(SearchConfig)} - {field.name for field in dataclasses.fields(Config)}
 CLOSED = _OWN | FREE | {"seed", "evaluation"}
-"""What no searched key may begin with."""
+"""First parts of keys that cannot be searched: they say how trials are run or measured."""
 
 
 def _first_trial(arguments: list[str]) -> list[str]:
     """Take the first of the values that a key is to be searched among."""
     if {"-m", "--multirun"} & set(arguments):
-        raise ConfigError("-m: a search is no sweep, it tries one set of values after the other; drop -m")
+        raise ConfigError("-m: a search is not a sweep, it tries one set of values after the other; drop -m")
     refuse_twice([argument.removeprefix("space.") for argument in arguments])
     return with_first_values(arguments)
 

@@ -1,4 +1,4 @@
-"""What a search draws its values from: written as for Hydra's Optuna sweeper, checked before anything starts."""
+"""The space of a search, written as for Hydra's Optuna sweeper and checked before anything starts."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -25,10 +25,10 @@ Space = Mapping[str, Distribution]
 def read_space(texts: Mapping[str, str], closed: set[str]) -> Space:
     """Return the distributions that the texts describe: `choice(a, b)`, `tag(log, interval(1e-5, 1e-3))`.
 
-    closed: what no searched key may begin with.
+    closed: first parts of keys that cannot be searched.
 
     Raises:
-        ConfigError: for such a key, and for a text that is no set of values.
+        ConfigError: for such a key, and for a text that is not a set of values.
     """
     return {key: _read(key, text, closed) for key, text in texts.items()}
 
@@ -45,7 +45,7 @@ def _read(key: str, text: str, closed: set[str]) -> Distribution:
         )
     values = override.value()
     if not override.is_sweep_override() or isinstance(values, Glob):
-        raise ConfigError(f"{key}={text}: no set of values; write choice(a, b), range(1, 9) or interval(0.1, 0.9)")
+        raise ConfigError(f"{key}={text}: not a set of values; write choice(a, b), range(1, 9) or interval(0.1, 0.9)")
     try:
         if isinstance(values, IntervalSweep):
             low, high, step = values.start, values.end, None
@@ -55,7 +55,7 @@ def _read(key: str, text: str, closed: set[str]) -> Distribution:
                 raise ValueError(f"more than {_MOST_NUMBERS:,} numbers; write interval(a, b)")
             numbers = drawn if isinstance(drawn, range) else [*drawn]
             if not numbers:
-                raise ValueError("there is no number in it")
+                raise ValueError("it has no numbers")
             low, high, step = min(numbers[0], numbers[-1]), max(numbers[0], numbers[-1]), abs(values.step)
         else:
             return CategoricalDistribution(list(dict.fromkeys(override.sweep_string_iterator())))
@@ -70,7 +70,7 @@ def _read(key: str, text: str, closed: set[str]) -> Distribution:
 
 
 def check_space(space: Space, overrides: Sequence[str]) -> Job:
-    """Compose the configs at the corners of a space; returns the first of them.
+    """Compose the configs at the corners of a space; return the first of them.
 
     Raises:
         ConfigError: for the first that is not valid, or a key that has a value already.

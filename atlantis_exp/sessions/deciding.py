@@ -74,7 +74,7 @@ class Contest:
         facts = {each: flatten(to_dict(job.config)) for each, job in jobs.items()}
         for key in question.by:
             if not all(resolve(key, each) for each in facts.values()):
-                raise ConfigError(f"{key}: is no single key; name those that differ, as in objective=dqn,quantile")
+                raise ConfigError(f"{key}: is not a single key; name those that differ, as in objective=dqn,quantile")
         by = shortened(question.by, facts[chosen[0]])
         self.question = replace(question, by=by)
         groups = {each: Group(values_in(facts[each], by), {}) for each in chosen}

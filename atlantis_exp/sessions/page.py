@@ -19,7 +19,7 @@ from atlantis_exp.tracking.publishing import publishing
 def ending(error: BaseException | None) -> tuple[Status, str]:
     """Return the last status of a page whose block raised `error`, and the reason.
 
-    What a signal or the end of the time has stopped was killed: the same command continues it.
+    A page that a signal or the end of the time has stopped was killed: the same command continues it.
     """
     if error is None:
         return "FINISHED", ""
@@ -41,7 +41,7 @@ def opened(
     others: Sequence[RunFolder] = (),
     ending: Callable[[BaseException | None], tuple[Status, str]] = ending,
 ) -> Iterator[Journal]:
-    """Hold a page's folder and publish its journal, which goes on behind what it says already.
+    """Hold a page's folder and publish its journal, continued from its last commit.
 
     The page is RUNNING in the block; `ending` gives its status after it.
 

@@ -48,7 +48,7 @@ _SHOWN = 10  # rows of the table at the end
 
 @dataclass(frozen=True)
 class Search:
-    """What is searched, over which training, and how."""
+    """A search as it was asked for: its space, its training, and its rules."""
 
     space: Mapping[str, BaseDistribution]
     texts: Mapping[str, str]  # the space, as typed
@@ -60,7 +60,7 @@ class Search:
     name: str | None  # of its folder; None: made from what is searched, and over which training
     startup: int  # trials drawn at random
     pruned_after: int | None  # trials that have ended before any is cut short; None: none ever is
-    spared: int  # evaluations of its own that a trial is spared
+    spared: int  # first evaluations, at which a trial is never cut short
     command: str  # that continues it
 
 

@@ -27,9 +27,9 @@ Command = Callable[..., int]
             "budget.steps: says how contenders are trained or measured, not what they are; one value only",
         ),
         (("model=cnn,resnet", "seeds=5,10"), "seeds: says how contenders are trained or measured, not what they are"),
-        (("experiment=fast,quick",), "experiment: a preset is no single key; name those that differ"),
-        (("phase=single,two_phase",), "phase: is no single key; name those that differ"),
-        (("optimizer.lr=interval(0,1)",), "optimizer.lr=interval(0,1): no list of values; write them out"),
+        (("experiment=fast,quick",), "experiment: a preset is not a single key; name those that differ"),
+        (("phase=single,two_phase",), "phase: is not a single key; name those that differ"),
+        (("optimizer.lr=interval(0,1)",), "optimizer.lr=interval(0,1): not a list of values; write them out"),
         (("model=cnn,rsenet",), "model=rsenet: no such option in conf/model; did you mean 'resnet'?"),
         (("optimizer.lr=0.001,1e-3",), "optimizer.lr=0.001: the same contender as optimizer.lr=0.001"),
         (("env.workers=1,2",), "env.workers=2: trains what env.workers=1 trains, under the same name"),
@@ -55,7 +55,7 @@ Command = Callable[..., int]
         (("against=model=cnn",), "model=cnn: the same contender as the config without it"),
         (("against=model=rsenet",), "model=rsenet: no such option in conf/model; did you mean 'resnet'?"),
         (("against=model",), "'model' is no override; write KEY=VALUE, as in model=resnet"),
-        (("model=glob(*)",), "model=glob(*): no list of values; write them out"),
+        (("model=glob(*)",), "model=glob(*): not a list of values; write them out"),
     ],
 )
 @pytest.mark.thinned(8)
