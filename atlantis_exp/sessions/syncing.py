@@ -11,7 +11,7 @@ from atlantis_exp import terminal
 from atlantis_exp.config import PathsConfig, TrackingConfig
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder, all_folders
-from atlantis_exp.tracking.mirror import forget_lost, publish
+from atlantis_exp.tracking.mirror import publish
 from atlantis_exp.tracking.store import Store, first_line
 
 
@@ -83,9 +83,8 @@ def publish_all(outputs: Path, store: Store, folders: Sequence[RunFolder] | None
     for folder in (each.path for each in reversed(folders)):  # sweeps before runs, which publish theirs
         run = str(folder.relative_to(outputs))
         try:
-            forget_lost(folder, store, listed)
             with terminal.working(f"publishing {run}"):
-                was_behind = publish(folder, store, is_primary=False)
+                was_behind = publish(folder, store, is_primary=False, listed=listed)
             yield Sent("published" if was_behind else "up to date", run)
         except Exception as error:
             if (fault := store.fault(error)) is not None:

@@ -188,7 +188,10 @@ def test_a_folder_that_names_a_server_is_not_sent_there_with_the_password(
     said = f"atlantis_exp: {uri} lacks parts of 2 runs; python -m atlantis_exp sync to={uri} sends them\n"
     assert capsys.readouterr().err.endswith(said)
     catch_up(tmp_path, uri, seconds=0.5)
-    assert asked
+    patience = time.monotonic() + 120
+    while not asked:
+        assert time.monotonic() < patience
+        time.sleep(0.05)
     (run / "published.json").write_text(json.dumps({"store": "http://h/$(x)#atlantis", "identity": "x"}))
     catch_up(tmp_path, uri, seconds=0.5)
     assert "sync 'to=http://h/$(x)' sends them" in capsys.readouterr().err
