@@ -3,7 +3,7 @@
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,7 +24,13 @@ class Sent(NamedTuple):
 
 
 def sync(
-    *, to: str | None, every: str | int | None, seconds: int | None, tracking: TrackingConfig, paths: PathsConfig
+    *,
+    to: str | None,
+    every: str | int | None,
+    seconds: int | None,
+    tracking: TrackingConfig,
+    paths: PathsConfig,
+    wait: Callable[[float], object] = time.sleep,
 ) -> None:
     """Publish all run folders, once or until interrupted; print a line a run that changed, and counts.
 
@@ -46,7 +52,7 @@ def sync(
             if seconds is None:
                 return
             is_first = False
-            time.sleep(seconds)
+            wait(seconds)
     except KeyboardInterrupt:
         sys.exit(130)  # 128 + SIGINT; what has arrived is noted
 
