@@ -3,7 +3,7 @@
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from atlantis_exp import terminal
 from atlantis_exp.config import PathsConfig, TrackingConfig
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder, all_folders
-from atlantis_exp.tracking.mirror import forget_lost, publish
+from atlantis_exp.tracking.mirror import publish
 from atlantis_exp.tracking.store import Store, first_line
 
 
@@ -24,7 +24,13 @@ class Sent(NamedTuple):
 
 
 def sync(
-    *, to: str | None, every: str | int | None, seconds: int | None, tracking: TrackingConfig, paths: PathsConfig
+    *,
+    to: str | None,
+    every: str | int | None,
+    seconds: int | None,
+    tracking: TrackingConfig,
+    paths: PathsConfig,
+    wait: Callable[[float], object] = time.sleep,
 ) -> None:
     """Publish all run folders, once or until interrupted; print a line a run that changed, and counts.
 
@@ -46,7 +52,7 @@ def sync(
             if seconds is None:
                 return
             is_first = False
-            time.sleep(seconds)
+            wait(seconds)
     except KeyboardInterrupt:
         sys.exit(130)  # 128 + SIGINT; what has arrived is noted
 
@@ -83,9 +89,8 @@ def publish_all(outputs: Path, store: Store, folders: Sequence[RunFolder] | None
     for folder in (each.path for each in reversed(folders)):  # sweeps before runs, which publish theirs
         run = str(folder.relative_to(outputs))
         try:
-            forget_lost(folder, store, listed)
             with terminal.working(f"publishing {run}"):
-                was_behind = publish(folder, store, is_primary=False)
+                was_behind = publish(folder, store, is_primary=False, listed=listed)
             yield Sent("published" if was_behind else "up to date", run)
         except Exception as error:
             if (fault := store.fault(error)) is not None:

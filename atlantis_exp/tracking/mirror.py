@@ -80,7 +80,7 @@ class Cursor:
 _CURSOR = TypeAdapter(Cursor)
 
 
-def publish(folder: Path, store: Store, is_primary: bool = True) -> bool:
+def publish(folder: Path, store: Store, is_primary: bool = True, listed: Collection[str] | None = None) -> bool:
     """Bring the MLflow run of a folder up to the folder's last commit; return whether it was behind.
 
     A run that has yet to start is left alone. May be repeated, interrupted, and run by several processes at once
@@ -92,6 +92,7 @@ def publish(folder: Path, store: Store, is_primary: bool = True) -> bool:
     Args:
         is_primary: whether this becomes the store that `unfinished` asks for; False leaves that to the one that is, if
             any, and notes in a file of its own how far it came.
+        listed: the ids of the store's runs, if they were asked for; a folder whose run is not among them is sent anew.
 
     Raises:
         ValueError: on a damaged journal, or a folder that is a link.
@@ -103,18 +104,20 @@ def publish(folder: Path, store: Store, is_primary: bool = True) -> bool:
     note = _note(folder, store, is_primary)
     with alone(note.with_suffix(".lock")):
         while (commit := read_commit(folder)) is not None and commit.status != "SCHEDULED":
+            cursor = Cursor.read(note)
+            is_lost = cursor is not None and listed is not None and cursor.run_id not in listed
+            if cursor and (cursor.store, cursor.commit) == (store.address, digest(commit)) and not is_lost:
+                return False
             try:
-                return _publish(folder, store, commit, note, is_primary)
+                _publish(folder, store, commit, note, cursor, is_primary)
+                return True
             except ValueError:
                 if read_commit(folder) == commit:
                     raise  # else its writer began anew while it was read
     return False
 
 
-def _publish(folder: Path, store: Store, commit: Commit, note: Path, is_primary: bool) -> bool:
-    cursor = Cursor.read(note)
-    if cursor and (cursor.store, cursor.commit) == (store.address, digest(commit)):
-        return False
+def _publish(folder: Path, store: Store, commit: Commit, note: Path, cursor: Cursor | None, is_primary: bool) -> None:
     cursor, run = _opened(cursor, note, folder, store, commit)
     mirror = _Mirror(folder, store, run)
     for offset, record in read(folder, cursor.offset, commit.offset):
@@ -127,7 +130,6 @@ def _publish(folder: Path, store: Store, commit: Commit, note: Path, is_primary:
         _log.warning("%s: %d files are gone and not published, such as %s", folder, len(mirror.gone), mirror.gone[0])
     mirror.send_state(commit, _parent_run(folder, store, commit, is_primary))
     replace(cursor, offset=commit.offset, commit=digest(commit)).save(note)
-    return True
 
 
 def digest(commit: Commit) -> str:
@@ -138,14 +140,6 @@ def digest(commit: Commit) -> str:
 def noted(folder: Path) -> list[Cursor]:
     """Return how far a folder is published in each store."""
     return [cursor for note in folder.glob("published*.json") if (cursor := Cursor.read(note))]
-
-
-def forget_lost(folder: Path, store: Store, listed: Collection[str]) -> None:
-    """Let a folder be published anew if its run is not among those that the store lists."""
-    note = _note(folder, store, is_primary=False)
-    cursor = Cursor.read(note)
-    if cursor is not None and cursor.store == store.address and cursor.run_id not in listed:
-        Cursor(cursor.store, cursor.identity).save(note)
 
 
 def _note(folder: Path, store: Store, is_primary: bool) -> Path:

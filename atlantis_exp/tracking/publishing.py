@@ -87,11 +87,13 @@ def publishing(
     outputs: Path,
     labels: Mapping[str, str],
     others: Sequence[RunFolder] = (),
+    seconds: float = _DRAIN_SECONDS,
 ) -> Iterator[Journal]:
     """Open a journal in the run's folder and mirror it to MLflow while it grows (tracking=mlflow).
 
     labels: tags that the run bears from its first moment.
     others: runs that other processes write and that are mirrored too.
+    seconds: to wait for MLflow at the end.
 
     Raises:
         JournalError: if the folder's journal is damaged.
@@ -106,7 +108,7 @@ def publishing(
         yield journal
     finally:
         with terminal.working("publishing to MLflow"):
-            is_sent = publisher.drain(_DRAIN_SECONDS)
+            is_sent = publisher.drain(seconds)
         if not is_sent:
             terminal.warn(f"MLflow has not taken all of {folder.name} yet; the run's folder has it")
 

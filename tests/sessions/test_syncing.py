@@ -48,9 +48,13 @@ def server(
         yield f"http://127.0.0.1:{port}", folder
 
 
-def synced(outputs: Path, *overrides: str) -> None:
+def config_of(outputs: Path, *overrides: str) -> SyncConfig:
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = checked(SyncConfig, compose("sync", [f"paths.outputs={outputs}", *overrides]))
+        return checked(SyncConfig, compose("sync", [f"paths.outputs={outputs}", *overrides]))
+
+
+def synced(outputs: Path, *overrides: str) -> None:
+    config = config_of(outputs, *overrides)
     sync(**vars(config), seconds=config.seconds)
 
 
@@ -188,7 +192,10 @@ def test_a_folder_that_names_a_server_is_not_sent_there_with_the_password(
     said = f"atlantis_exp: {uri} lacks parts of 2 runs; python -m atlantis_exp sync to={uri} sends them\n"
     assert capsys.readouterr().err.endswith(said)
     catch_up(tmp_path, uri, seconds=0.5)
-    assert asked
+    patience = time.monotonic() + 120
+    while not asked:
+        assert time.monotonic() < patience
+        time.sleep(0.05)
     (run / "published.json").write_text(json.dumps({"store": "http://h/$(x)#atlantis", "identity": "x"}))
     catch_up(tmp_path, uri, seconds=0.5)
     assert "sync 'to=http://h/$(x)' sends them" in capsys.readouterr().err
@@ -218,6 +225,46 @@ def test_a_store_that_was_thrown_away_is_made_again(tmp_path: Path, capsys: pyte
     assert shown(tmp_path, "plain") == before
     synced(tmp_path)
     assert capsys.readouterr().out.endswith(": 2 runs: 2 up to date\n")
+
+
+def test_it_looks_again_and_says_only_what_changed_until_it_is_interrupted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a_sweep_of_one(tmp_path, "plain")
+    told: list[str] = []
+
+    def wait(seconds: float) -> None:
+        assert seconds == 30
+        told.append("".join(line for line in "".join(capsys.readouterr()).splitlines(True) if not WAITING.search(line)))
+        if len(told) == 2:
+            (tmp_path / "runs/plain/commit.json").write_text("{")
+        if len(told) == 3:
+            raise KeyboardInterrupt
+
+    config = config_of(tmp_path, "every=30s")
+    with pytest.raises(SystemExit, match="130"):
+        sync(**vars(config), seconds=config.seconds, wait=wait)
+    first, second, third = told
+    assert first.endswith(": 2 runs: 2 published\n")
+    assert second == ""
+    assert "1 failed, 1 up to date" in third
+    assert third.endswith("1 of 2 runs failed; looking again in 30s\n")
+
+
+def test_a_store_that_fails_in_the_middle_ends_it_and_a_folder_that_fails_does_not(tmp_path: Path) -> None:
+    class Failing(Store):
+        is_gone = False
+
+        def fault(self, error: Exception) -> Fault | None:
+            return Fault(f"no answer: {error}") if self.is_gone else None
+
+    a_sweep_of_one(tmp_path, "plain")
+    (tmp_path / "sweeps/sweep-plain/commit.json").write_text("{")
+    store = Failing(tmp_path)
+    assert [sent.outcome for sent in publish_all(tmp_path, store)] == ["failed", "failed"]  # the run's parent, too
+    store.is_gone = True
+    with pytest.raises(Fault, match="no answer"):
+        [*publish_all(tmp_path, store)]
 
 
 @pytest.mark.slow

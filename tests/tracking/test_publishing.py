@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from atlantis_exp.config import Config
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal, adopt, read_commit
@@ -54,6 +55,68 @@ def test_a_folder_whose_commit_is_not_a_file_is_one_line(
     said = capsys.readouterr().err
     assert said.startswith(f"atlantis_exp: {folder / 'commit.json'} is damaged")
     assert said.count("\n") == 1
+
+
+@pytest.fixture
+def behind(tmp_path: Path) -> Callable[[str, str | None], Path]:
+    """Writes the folder of a run that a store, the local one or a server, lacks."""
+
+    def write(name: str, server: str | None = None) -> Path:
+        folder = tmp_path / "runs" / name
+        journal = Journal(folder)
+        journal.metrics({"score": 1.0}, 1)
+        journal.finish()
+        address, identity = Store(tmp_path, tracking_uri=server).address, read_commit(folder).identity  # type: ignore[union-attr]
+        Cursor(address, identity).save(folder / "published.json")
+        return folder
+
+    return write
+
+
+def test_what_earlier_commands_left_is_published_but_for_runs_that_do_so_themselves(
+    tmp_path: Path, behind: Callable[[str], Path]
+) -> None:
+    continued, left, running = (behind(name) for name in ("continued", "left", "running"))
+    Journal(running).status("RUNNING")
+    with RunFolder(running).held():
+        catch_up(tmp_path, continued=continued)
+    lacking = [unfinished(folder, tmp_path) is not None for folder in (continued, left, running)]
+    assert lacking == [True, False, True]
+
+
+def test_a_server_that_is_named_is_asked_once_and_not_again_for_each_run(
+    tmp_path: Path,
+    behind: Callable[[str, str], Path],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    uri = "http://127.0.0.1:9"
+    first, second = (behind(name, uri) for name in ("first", "second"))
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
+    catch_up(tmp_path, seconds=1.0)
+    assert "lacks parts" not in capsys.readouterr().err
+    assert (first / "published.lock").exists()
+    assert not (second / "published.lock").exists()
+
+
+def test_a_command_publishes_its_run_and_others_and_says_where_it_could_not(
+    tmp_path: Path, tiny: Callable[..., Config], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, other = (RunFolder(tmp_path / "runs" / name) for name in ("own", "other"))
+    Journal(other.path).status("RUNNING")
+    local, none = (tiny(f"tracking={name}").tracking for name in ("mlflow", "none"))
+    away = tiny("tracking=server", "tracking.uri=http://127.0.0.1:9").tracking
+    with publishing.publishing(folder, none, tmp_path, {}, [other]) as journal:
+        journal.status("RUNNING")
+    assert not list(tmp_path.rglob("published*"))
+    assert not list(tmp_path.glob("mlflow*"))
+    with publishing.publishing(folder, local, tmp_path, {"kind": "x"}, [other], seconds=120):
+        pass
+    assert {run.info.run_name for run in Store(tmp_path).runs()} == {"own", "other"}
+    assert capsys.readouterr().err == ""
+    with publishing.publishing(folder, away, tmp_path, {}, seconds=0.1):
+        pass
+    assert "MLflow has not taken all of own yet" in capsys.readouterr().err
 
 
 def test_the_way_to_the_ui_says_how_many_runs_the_store_lacks(tmp_path: Path) -> None:
