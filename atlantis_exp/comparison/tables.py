@@ -17,7 +17,7 @@ from atlantis_exp.comparison.published import Row, Table, curves, scores
 from atlantis_exp.comparison.verdict import Answer, Question, answer, families, group_of, one_a_seed
 from atlantis_exp.comparison.words import said
 from atlantis_exp.components import facts_of, title_of
-from atlantis_exp.decision import FEWEST_SEEDS, Look, Plan, Verdict, decide, equal_scores, mean_interval, modes
+from atlantis_exp.decision import FEWEST_SEEDS, Look, Plan, Verdict, decide, equal_scores, mean_interval
 from atlantis_exp.registry import Game
 from atlantis_exp.statistics import Scores, human_normalised, probability_of_improvement, summarize
 
@@ -68,7 +68,6 @@ def compare(
     named: list[tuple[str, dict[str, dict[int, float]], Answer | None]] = [
         (each.family.name, each.family.seeds, each) for each in answers
     ] or [("all", by_label, None)]
-    evaluation = [_evaluation(label, runs, game) for label, runs in groups.items()]
     tables: dict[str, Table] = {
         "scores": [row for family in named for row in _scores(*family)],
         "seeds": [
@@ -80,9 +79,8 @@ def compare(
         "verdict": [{"family": each.family.name, **_verdict(of)} for each in answers for of in each.decision.verdicts],
         "plan": [_plan(each) for each in answers],
         "looks": [row for each in answers for row in _looks(each)],
-        "evaluation": evaluation,
+        "evaluation": [_evaluation(label, runs, game) for label, runs in groups.items()],
         "why": [_why(label, runs, game.sources) for label, runs in groups.items()],
-        "modes": [row for row in evaluation for row in _modes(row, by_label[row["group"]])],
         "improvement": _improvement(groups),
         "views": _views(groups),
         "runs": [row for label, runs in groups.items() for row in _runs(label, runs)],
@@ -229,23 +227,6 @@ def _why(label: str, runs: Sequence[Training], sources: Sequence[str]) -> Row:
         "points_per_1000_frames": float(_pooled(runs).sum() / thousands),
         **dict(zip(sources, (_pooled(runs, "points").sum(axis=0) / thousands).tolist(), strict=True)),
     }
-
-
-def _modes(evaluation: Row, seeds: Mapping[int, float]) -> Table:
-    """Return one row if a group's seeds fall into two modes: the share that survives, and both scores."""
-    if (found := modes(list(seeds.values()))) is None:
-        return []
-    return [
-        {
-            "group": evaluation["group"],
-            "seeds": len(seeds),
-            "upper_share": found.share,
-            "upper_score": found.upper,
-            "lower_score": found.lower,
-            "time_cap_share": evaluation["time_cap_share"],
-            "points_per_frame": evaluation["points_per_frame"],
-        }
-    ]
 
 
 def _runs(label: str, runs: Sequence[Training]) -> Table:

@@ -288,7 +288,6 @@ def test_fewer_than_five_seeds_never_decide_not_even_when_asked_to_look_now() ->
         assert comparison.verdict == "Not decided: cnn against resnet; next look at 5 seeds (cnn has 4)."
         assert comparison.tables["looks"] == []
     assert "look=now took no look" in comparison.caveats[-1]
-    assert "cnn has 4 of the 5 seeds without which nothing is decided." in comparison.notes
 
 
 def test_looks_are_taken_where_they_are_planned_and_the_same_seeds_charge_nothing_again() -> None:
@@ -339,16 +338,14 @@ def test_a_look_that_nobody_planned_is_charged_and_said() -> None:
     assert [look.size for look in each.decision.looks] == [5, 7]
     charged = 0.05 * (0.49 - 0.25)
     assert each.decision.looks[1].error == pytest.approx(charged)
-    said = f"By model, a look was taken at 7 seeds, where none was planned: it spent {charged:.2%} of the error."
-    assert said in comparison.caveats
     assert spent(each) == "looks planned at 5 and 10 seeds; taken: 5, 7; error spent: 2.45% of 5.00%"
     assert comparison.tables["plan"][0]["taken"] == "5 7"
 
 
-def test_a_planned_look_that_is_late_is_said_to_be() -> None:
+def test_a_planned_look_that_is_late_is_charged_for_the_seeds_it_has() -> None:
     runs = [*around("cnn", 3_000.0, range(7)), *around("resnet", 3_015.0, range(7))]
-    said = "By model, the look planned at 5 seeds was taken at 7: it spent 2.45% of the error."
-    assert said in compared(runs).caveats
+    (each,) = compared(runs).answers
+    assert spent(each) == "looks planned at 5 and 10 seeds; taken: 7; error spent: 2.45% of 5.00%"
 
 
 def test_what_would_have_been_found_is_not_said_of_seeds_that_do_not_differ() -> None:
@@ -477,14 +474,10 @@ def test_runs_of_a_look_that_are_gone_or_score_otherwise_are_named() -> None:
 def test_seeds_that_fall_into_modes_come_with_survival_and_points_per_frame() -> None:
     runs = [*around("cnn", 5_000.0, range(4)), *around("cnn", 1_000.0, [4, 5]), *around("resnet", 5_000.0, range(6))]
     comparison = compared(runs)
-    (row,) = comparison.tables["modes"]
-    assert (row["group"], row["upper_share"]) == ("cnn", pytest.approx(4 / 6))
-    assert row["upper_score"] == pytest.approx(5_005)
-    (evaluation, _) = comparison.tables["evaluation"]
     scores = np.concatenate([run.episodes.scores for run in runs[:6]])
-    assert row["points_per_frame"] == evaluation["points_per_frame"] == pytest.approx(scores.mean() / 100)
+    assert comparison.tables["evaluation"][0]["points_per_frame"] == pytest.approx(scores.mean() / 100)
     assert any(line.startswith("cnn falls into two modes: 67% of its seeds score 5,005") for line in comparison.caveats)
-    assert "in the upper mode" in page(comparison, {}, {})
+    assert "falls into two modes" in page(comparison, {}, {})
 
 
 def test_runs_of_different_precisions_devices_or_processors_are_named() -> None:
@@ -557,9 +550,7 @@ def learned(**ends: float) -> list[Training]:
 
 def test_nobody_leads_while_training_where_the_interval_includes_zero() -> None:
     (note, *_) = compared(learned(cnn=1_010.0, resnet=1_000.0)).notes
-    assert note == (
-        "In training, no lead is clear at equal frames, where an interval includes zero: descriptions, not verdicts."
-    )
+    assert note.startswith("In training, no lead is clear at equal frames, where an interval includes zero; ")
     (note, *_) = compared(learned(cnn=9_000.0, resnet=1_000.0, tiny=8_990.0)).notes
     assert "no lead is clear" in note
 
@@ -567,16 +558,16 @@ def test_nobody_leads_while_training_where_the_interval_includes_zero() -> None:
 def test_who_leads_while_training_is_said_as_a_description() -> None:
     runs = learned(cnn=1_000.0, resnet=2_000.0)
     comparison = compared(runs)
-    assert "In training, resnet leads at equal frames: descriptions, not verdicts." in comparison.notes
+    assert comparison.notes[0] == (
+        "In training, resnet leads at equal frames; nothing is known of equal hours and equal gradient FLOPs, since a "
+        "run has no such curve or too short a one: descriptions, not verdicts."
+    )
     (view,) = comparison.tables["views"]
     assert (view["leader"], view["difference"]) == ("resnet", pytest.approx(1_000))
     assert view["low"] < 1_000 < view["high"]
     assert "decided" not in view
     few = compared(runs[:3] + runs[5:8])
-    assert (
-        few.notes[0]
-        == "In training, nothing can be said of equal frames, for want of seeds: descriptions, not verdicts."
-    )
+    assert few.notes[0].startswith("In training, nothing can be said of equal frames, for want of seeds; ")
     assert all(np.isnan(row["low"]) for row in (*few.tables["views"], *few.tables["curves"]))
     assert len({row["run"] for row in few.tables["seed_curves"]}) == 6
     assert comparison.tables["seed_curves"] == []
