@@ -3,7 +3,7 @@
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import combinations
 from math import isnan
@@ -157,16 +157,7 @@ def _mean_interval(seeds: Sequence[float] | Array) -> tuple[float, float]:
 
 
 def _verdict(verdict: Verdict) -> Row:
-    return {
-        "group": verdict.group,
-        "other": verdict.other,
-        "said": verdict.said,
-        "difference": verdict.difference,
-        "low": verdict.low,
-        "high": verdict.high,
-        "seeds": verdict.seeds,
-        "detectable": _NAN if verdict.detectable is None else verdict.detectable,
-    }
+    return {**asdict(verdict), "detectable": _NAN if verdict.detectable is None else verdict.detectable}
 
 
 def _plan(answer: Answer) -> Row:
@@ -256,12 +247,9 @@ def _runs(label: str, runs: Sequence[Training]) -> Table:
 
 
 def _improvement(groups: Groups) -> Table:
+    scores = {label: _pooled(runs) for label, runs in groups.items()}
     return [
-        {
-            "group": one,
-            "over": other,
-            "probability": probability_of_improvement(_pooled(groups[one]), _pooled(groups[other])),
-        }
+        {"group": one, "over": other, "probability": probability_of_improvement(scores[one], scores[other])}
         for one, other in combinations(groups, 2)
     ]
 
@@ -332,15 +320,9 @@ def _actions(label: str, runs: Sequence[Training]) -> Table:
 def _episodes(label: str, training: Training) -> Table:
     table = training.episodes
     rows = zip(table.scores.tolist(), table.steps.tolist(), table.truncated.tolist(), strict=True)
+    of = {"run": training.name, "group": label}
     return [
-        {
-            "run": training.name,
-            "group": label,
-            "episode": index,
-            "score": score,
-            "steps": int(steps),
-            "truncated": int(truncated),
-        }
+        {**of, "episode": index, "score": score, "steps": int(steps), "truncated": int(truncated)}
         for index, (score, steps, truncated) in enumerate(rows)
     ]
 
