@@ -91,6 +91,8 @@ ERROR, SAID = "spent another error than the plan lets them", "say what their int
         (change(high=-20.0), SAID),
         (change(difference=1e6), SAID),
         (change(difference=-1e6), SAID),
+        (change(verdict=1, high=0.0), SAID),
+        (change(verdict=1, said="better", low=0.0, difference=1.0, high=2.0), SAID),
     ],
 )
 def test_a_record_that_the_comparison_cannot_have_written_is_refused_with_the_reason(
@@ -106,6 +108,26 @@ def test_a_record_that_the_comparison_cannot_have_written_is_refused_with_the_re
     assert re.search(
         rf"is no record of this comparison's looks \((its looks by model )?({reason})\): restore it", str(refused.value)
     )
+
+
+@pytest.mark.parametrize(
+    "edge",
+    [
+        change(low=0.0, difference=0.0),
+        change(high=0.0),
+        change(verdict=1, high=-0.5),
+        change(verdict=1, said="better", low=0.5, difference=0.5, high=0.5),
+    ],
+)
+def test_a_record_may_have_any_interval_that_its_verdict_allows(
+    tmp_path: Path, edge: Callable[[dict[str, Any]], None]
+) -> None:
+    written(tmp_path)
+    path = tmp_path / "looks.json"
+    record = json.loads(path.read_text())
+    edge(record)
+    path.write_text(json.dumps(record))
+    assert len(read_looks(tmp_path, asked())["model"]) == 2
 
 
 @pytest.mark.parametrize("strike", [lambda text: text[:-20], lambda _: "[" * 100_000, lambda _: ""])
