@@ -1,7 +1,7 @@
 """One module a verb: its schema, its overrides and one call.
 
 In: what a person typed. Out: checked values for the floors below. Hydra, OmegaConf and the command line live here and
-nowhere else; what a verb does lives in `sessions` and `comparison`.
+nowhere else; what a verb does lives in `sessions`.
 """
 
 import importlib

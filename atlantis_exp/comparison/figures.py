@@ -1,10 +1,9 @@
-"""Tables to figures: Okabe and Ito's colours, and a line style a group, so that no colour is needed to tell."""
+"""Draw the tables of a comparison; a group has a colour and a line style, so that either tells it."""
 
 import io
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from html import escape
@@ -47,7 +46,7 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure as a picture of its own and as a part of a page, whose colour of text it takes on."""
+    """A figure as a picture, and as a part of a page that takes on the colour of its text."""
 
     title: str
     alt: str  # what it shows, in words
@@ -56,92 +55,80 @@ class Drawn:
 
 
 def draw(comparison: Comparison) -> dict[str, Drawn]:
-    """All figures of a comparison by name; one without data is left out."""
-    tables, groups = comparison.tables, comparison.groups
-    drawn: dict[str, Drawn] = {}
+    """Draw all figures of a comparison, by name; one without data is left out."""
+    tables, groups, drawn = comparison.tables, comparison.groups, dict[str, Drawn]()
+
+    def add(name: str, plot: Callable[..., None], title: str, alt: str, height: float = _HEIGHT, **of: Any) -> None:
+        drawn[name] = _render(partial(plot, comparison=comparison, **of), title, alt, height)
+
     for axis, view in AXES.items():
         if rows := [row for row in tables["curves"] if row["axis"] == axis]:
-            drawn[f"learning_{axis}"] = _render(
-                partial(_learning, comparison=comparison, axis=axis, rows=rows),
-                f"Learning at {view}",
-                f"Training score, mean of 100 episodes, by {_UNITS[axis]}; at last, while all runs of a group go on: "
-                + _said(groups, rows, "score"),
+            add(
+                *(f"learning_{axis}", _learning, f"Learning at {view}"),
+                f"Training score, mean of 100 episodes, by {_UNITS[axis]}; at the last point that all runs of a group "
+                f"reach: {_said(groups, rows, 'score')}",
+                axis=axis,
+                rows=rows,
             )
             if axis == "frames":
-                drawn["exploration"] = _render(
-                    partial(_exploration, comparison=comparison, rows=rows),
-                    "Exploration while training",
+                add(
+                    *("exploration", _exploration, "Exploration while training"),
                     "Epsilon by emulator frames of training, as in report figure 4.1; at the end: "
                     + _said(groups, rows, "epsilon", ".3f"),
+                    rows=rows,
                 )
-    scores = tables["scores"]
-    drawn["scores"] = _render(
-        partial(_scores, comparison=comparison),
-        "Scores",
+    scores, row_height = tables["scores"], 1.2 + 0.45 * len(groups)
+    add(
+        *("scores", _scores, "Scores"),
         "One dot a seed, the score as a diamond, with its 95 % interval from five seeds on; scores: "
         + _said([row["group"] for row in scores], scores, "score"),
-        height=1.2 + 0.45 * len(scores),
+        1.2 + 0.45 * len(scores),
     )
     if comparison.game.sources:
-        drawn["why"] = _render(
-            partial(_why, comparison=comparison),
-            "Rate and survival",
+        add(
+            *("why", _why, "Rate and survival"),
             "Points per 1,000 emulator frames, split by what paid them, and at each bar the mean frames of an episode; "
             "rates: " + _said(groups, tables["why"], "points_per_1000_frames"),
-            height=1.6 + 0.6 * len(groups),
+            1.6 + 0.6 * len(groups),
         )
-    few = any(row["episodes"] < _FEW for row in tables["evaluation"])
-    drawn["distribution"] = _render(
-        partial(_strips if few else _distribution, comparison=comparison),
-        "Distribution of the evaluated scores",
-        ("One dot an evaluated episode" if few else "Histogram of evaluated scores, one step line a group")
-        + "; medians: "
-        + _said(groups, tables["evaluation"], "median"),
-        height=1.2 + 0.45 * len(groups) if few else _HEIGHT,
-    )
-    drawn["profile"] = _render(
-        partial(_profile, comparison=comparison),
-        "Share of episodes above a score",
+    medians = f"; medians: {_said(groups, tables['evaluation'], 'median')}"
+    if any(row["episodes"] < _FEW for row in tables["evaluation"]):
+        distribution = (_strips, "One dot an evaluated episode", row_height)
+    else:
+        distribution = (_distribution, "Histogram of evaluated scores, one step line a group", _HEIGHT)
+    plot, alt, height = distribution
+    add("distribution", plot, "Distribution of the evaluated scores", alt + medians, height)
+    add(
+        *("profile", _profile, "Share of episodes above a score"),
         "Performance profile: for each score the share of a group's episodes that exceed it.",
     )
-    drawn["actions"] = _render(
-        partial(_actions, comparison=comparison),
-        "Who chose which action",
+    chance = {group: sum(row["random"] for row in tables["actions"] if row["group"] == group) for group in groups}
+    add(
+        *("actions", _actions, "Who chose which action"),
         "Share of each action in evaluation, split into network and chance; all actions of chance: "
-        + "; ".join(
-            f"{group} {sum(row['random'] for row in tables['actions'] if row['group'] == group):.1%}"
-            for group in groups
-        ),
-        height=1.2 + 0.6 * len(groups),
+        + "; ".join(f"{group} {share:.1%}" for group, share in chance.items()),
+        1.2 + 0.6 * len(groups),
     )
     if tables["references"]:
-        drawn["references"] = _render(
-            partial(_references, comparison=comparison),
-            "Against other players",
+        add(
+            *("references", _references, "Against other players"),
             "Mean scores of the groups among measured players and published algorithms"
             + (", on a logarithmic axis." if comparison.game.is_logarithmic else "."),
-            height=1.0 + 0.24 * (len(groups) + len(tables["references"])),
+            1.0 + 0.24 * (len(groups) + len(tables["references"])),
         )
     return drawn
 
 
 def _render(plot: Callable[["Axes"], None], title: str, alt: str, height: float = _HEIGHT) -> Drawn:
-    with _style():
-        from matplotlib.figure import Figure
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
 
+    with rc_context(_STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(4.8, height), dpi=150, facecolor="white", layout="constrained")
         plot(figure.add_subplot())
         png = _png(figure)
         figure.set_layout_engine("none")  # the layout is found, once for both pictures
         return Drawn(title, alt, png, _svg(figure, alt))
-
-
-@contextmanager
-def _style() -> Iterator[None]:
-    from matplotlib import rc_context
-
-    with rc_context(_STYLE):  # type: ignore[arg-type]
-        yield
 
 
 def _png(figure: "Figure") -> bytes:
@@ -178,8 +165,14 @@ def _look(groups: Sequence[str], group: str) -> dict[str, Any]:
     return {"color": _COLOURS[index % len(_COLOURS)], "linestyle": _LINES[index % len(_LINES)]}
 
 
+def _columns(rows: Table, group: str, *keys: str) -> list[list[float]]:
+    """Return columns of a group's rows."""
+    own = [row for row in rows if row["group"] == group]
+    return [[row[key] for row in own] for key in keys]
+
+
 def thousands(axis: Any) -> None:
-    """Write 20k in the place of 2 x 10^4 at an axis, and on a logarithmic one between powers of ten."""
+    """Write 20k for 2 x 10^4 at an axis, on a logarithmic one between powers of ten, too."""
     from matplotlib.ticker import EngFormatter, LogFormatter
 
     written = EngFormatter(sep="")
@@ -187,7 +180,7 @@ def thousands(axis: Any) -> None:
     if axis.get_scale() == "log":
 
         class Between(LogFormatter):
-            """Numbers at those ticks between powers of ten where a logarithmic axis has room for them."""
+            """Write numbers between powers of ten where a logarithmic axis has room for them."""
 
             def __call__(self, x: float, pos: int | None = None) -> str:
                 return written(x) if super().__call__(x, pos) else ""
@@ -195,8 +188,14 @@ def thousands(axis: Any) -> None:
         axis.set_minor_formatter(Between())
 
 
+def _rows(axes: "Axes", names: Sequence[str], above: float = 0.8) -> None:
+    """Name the rows of a figure, from above."""
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.4, -above)
+
+
 def _legend(axes: "Axes", columns: int = 2) -> None:
-    """Name what is drawn above the axes, in as many columns as fit, and make the figure higher by that."""
+    """Put a legend above the axes, in as many columns as fit, and make the figure higher by that."""
     if not axes.get_legend_handles_labels()[0]:
         return
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -214,7 +213,7 @@ def _legend(axes: "Axes", columns: int = 2) -> None:
 
 
 def _reference_lines(draw_line: Callable[..., Any], comparison: Comparison, low: float, high: float) -> None:
-    """The players' scores as grey lines, those that lie within a factor of two, or the width, of what is drawn."""
+    """Draw players' scores as grey lines, if within a factor of two, or the width, of the rest."""
     references = comparison.tables["references"]
     least, most = (low / 2, high * 2) if comparison.game.is_logarithmic else (2 * low - high, 2 * high - low)
     shown = [row for row in references if row["kind"] == "player" and least <= row["score"] <= most]
@@ -231,8 +230,7 @@ def _learning(axes: "Axes", comparison: Comparison, axis: str, rows: Table) -> N
     ends = {row["group"]: row["score"] for row in rows}
     leading = sorted(ends, key=lambda group: -ends[group])[:2]  # more bands over each other show nothing
     for group in comparison.groups:
-        own = [row for row in rows if row["group"] == group]
-        x, score, low, high = ([row[key] for row in own] for key in ("x", "score", "low", "high"))
+        x, score, low, high = _columns(rows, group, "x", "score", "low", "high")
         look = _look(comparison.groups, group)
         axes.plot(x, score, label=group, **look)
         if group in leading:
@@ -255,7 +253,7 @@ def _learning(axes: "Axes", comparison: Comparison, axis: str, rows: Table) -> N
 
 
 def _published(axes: "Axes", rows: Table) -> None:
-    """Published curves in grey, by marks; they leave the picture rather than make it more than twice as high."""
+    """Draw published curves in grey, cut off if they would make the figure more than twice as high."""
     curves = defaultdict(list)
     for row in rows:
         curves[row["name"]].append((row["frames"], row["mean"]))
@@ -269,10 +267,7 @@ def _published(axes: "Axes", rows: Table) -> None:
 
 def _exploration(axes: "Axes", comparison: Comparison, rows: Table) -> None:
     for group in comparison.groups:
-        own = [row for row in rows if row["group"] == group]
-        axes.plot(
-            *([row[key] for row in own] for key in ("x", "epsilon")), label=group, **_look(comparison.groups, group)
-        )
+        axes.plot(*_columns(rows, group, "x", "epsilon"), label=group, **_look(comparison.groups, group))
     axes.set_ylim(0, 1)
     axes.set_xlabel(_UNITS["frames"])
     axes.set_ylabel("epsilon")
@@ -298,8 +293,7 @@ def _scores(axes: "Axes", comparison: Comparison) -> None:
     ends = [seed["score"] for seed in comparison.tables["seeds"]]
     _reference_lines(axes.axvline, comparison, min(ends), max(ends))
     axes.margins(x=0.1)
-    axes.set_yticks(range(len(table)), [row["group"] for row in table])
-    axes.set_ylim(len(table) - 0.4, -0.8)
+    _rows(axes, [row["group"] for row in table])
     axes.set_xlabel("score, one dot a seed")
     thousands(axes.xaxis)
     _legend(axes)
@@ -321,24 +315,21 @@ def _why(axes: "Axes", comparison: Comparison) -> None:
     rates = [row["points_per_1000_frames"] for row in rows]
     if min(rates) >= 0:
         axes.set_xlim(0, 1.45 * max(rates) or 1)
-    axes.set_yticks(range(len(rows)), [row["group"] for row in rows])
-    axes.set_ylim(len(rows) - 0.4, -0.6)
+    _rows(axes, [row["group"] for row in rows], 0.6)
     axes.set_xlabel("points per 1,000 frames")
     thousands(axes.xaxis)
     _legend(axes)
 
 
 def _distribution(axes: "Axes", comparison: Comparison) -> None:
-    scores = defaultdict(list)
-    for row in comparison.tables["episodes"]:
-        scores[row["group"]].append(row["score"])
-    everything = np.concatenate([*scores.values()])
-    edges = np.linspace(min(0.0, everything.min()), max(everything.max(), 1.0), 31)  # 30 bins, as in report figure 3.1
+    episodes = comparison.tables["episodes"]
+    everything = [row["score"] for row in episodes]
+    edges = np.linspace(min(0.0, *everything), max(1.0, *everything), 31).tolist()  # 30 bins, as in report figure 3.1
     for group in comparison.groups:
-        look = _look(comparison.groups, group)
-        weights = np.full(len(scores[group]), 1 / len(scores[group]))
-        axes.hist(scores[group], edges.tolist(), weights=weights.tolist(), histtype="stepfilled", alpha=0.15, **look)
-        axes.hist(scores[group], edges.tolist(), weights=weights.tolist(), histtype="step", label=group, **look)
+        (scores,) = _columns(episodes, group, "score")
+        look = {"weights": [1 / len(scores)] * len(scores), **_look(comparison.groups, group)}
+        axes.hist(scores, edges, histtype="stepfilled", alpha=0.15, **look)
+        axes.hist(scores, edges, histtype="step", label=group, **look)
     axes.set_xlabel("score")
     axes.set_ylabel("share of episodes")
     thousands(axes.xaxis)
@@ -346,24 +337,22 @@ def _distribution(axes: "Axes", comparison: Comparison) -> None:
 
 
 def _strips(axes: "Axes", comparison: Comparison) -> None:
-    """A row of dots a group; equal scores are piled up."""
+    """Draw a row of dots for each group; equal scores are piled up."""
     piles = Counter((row["group"], row["score"]) for row in comparison.tables["episodes"])
     gap = min(0.08, 0.6 / max(piles.values()))
     for (group, score), size in piles.items():
         heights = comparison.groups.index(group) - gap * np.arange(size)
         colour = _look(comparison.groups, group)["color"]
         axes.plot(np.full(size, score), heights, "o", color=colour, markersize=5, alpha=0.6)
-    axes.set_yticks(range(len(comparison.groups)), comparison.groups)
-    axes.set_ylim(len(comparison.groups) - 0.4, -0.8)
+    _rows(axes, comparison.groups)
     axes.set_xlabel("score, one dot an episode")
     thousands(axes.xaxis)
 
 
 def _profile(axes: "Axes", comparison: Comparison) -> None:
     for group in comparison.groups:
-        rows = [row for row in comparison.tables["profile"] if row["group"] == group]
-        tau, share = ([row[key] for row in rows] for key in ("tau", "share"))
-        axes.plot(tau, share, label=group, **_look(comparison.groups, group))
+        points = _columns(comparison.tables["profile"], group, "tau", "share")
+        axes.plot(*points, label=group, **_look(comparison.groups, group))
     is_logarithmic = comparison.game.is_logarithmic
     axes.set_xscale("log" if is_logarithmic else "linear")
     thousands(axes.xaxis)
@@ -374,19 +363,15 @@ def _profile(axes: "Axes", comparison: Comparison) -> None:
 
 
 def _actions(axes: "Axes", comparison: Comparison) -> None:
-    rows = defaultdict(list)
-    for row in comparison.tables["actions"]:
-        rows[row["group"]].append(row)
     for y, group in enumerate(comparison.groups):
         left = 0.0
-        for index, row in enumerate(rows[group]):
+        rows = [row for row in comparison.tables["actions"] if row["group"] == group]
+        for row, colour in zip(rows, cycle(_COLOURS), strict=False):
             label = row["action"] if y == 0 else None
-            colour = _COLOURS[index % len(_COLOURS)]
             axes.barh(y, row["network"], 0.6, left, color=colour, label=label)
             axes.barh(y, row["random"], 0.6, left + row["network"], color=colour, hatch="////", edgecolor="white")
             left += row["network"] + row["random"]
-    axes.set_yticks(range(len(comparison.groups)), comparison.groups)
-    axes.set_ylim(len(comparison.groups) - 0.4, -0.6)
+    _rows(axes, comparison.groups, 0.6)
     axes.set_xlim(0, 1)
     axes.xaxis.set_major_formatter("{x:.0%}")
     axes.set_xlabel("share of steps (hatched: by chance)")

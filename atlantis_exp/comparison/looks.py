@@ -1,4 +1,4 @@
-"""The record of a comparison's looks, `looks.json` in its folder: what the next look must know of those before."""
+"""Keep the record of a comparison's looks, `looks.json` in its folder, which the next look continues."""
 
 import json
 from collections.abc import Sequence
@@ -21,10 +21,10 @@ Record = dict[str, list[Look]]
 
 
 def read_looks(folder: Path, families: Sequence[Family]) -> Record:
-    """The looks taken at some families; empty before the first.
+    """Read the looks taken at some families; empty before the first.
 
     Raises:
-        Fault: on a file that no comparison of these families left so, or where a comparison that was made lacks it.
+        Fault: if no comparison of these families can have written the file, or a comparison that was made lacks it.
     """
     path = folder / LOOKS
     if not path.exists():
@@ -47,7 +47,7 @@ def read_looks(folder: Path, families: Sequence[Family]) -> Record:
 
 
 def write_looks(folder: Path, answers: Sequence[Answer]) -> None:
-    """Keep the looks of all families, before anybody sees what they found."""
+    """Write the looks of all families; call it before their verdicts are shown."""
     record = {answer.family.name: [asdict(look) for look in answer.decision.looks] for answer in answers}
     write_file(folder / LOOKS, json.dumps(record, indent=1).encode())
 

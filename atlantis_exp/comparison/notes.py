@@ -8,10 +8,10 @@ from math import isclose, nan
 from statistics import fmean
 
 from atlantis_exp.comparison.choosing import COMMIT, resolve, values_in
-from atlantis_exp.comparison.decision import FEWEST_SEEDS, equal_scores
+from atlantis_exp.comparison.decision import equal_scores, modes
 from atlantis_exp.comparison.gather import AXES, StoredRun, Training
 from atlantis_exp.comparison.published import Table, early_dqn, random_line
-from atlantis_exp.comparison.verdict import Answer
+from atlantis_exp.comparison.verdict import Answer, group_of
 from atlantis_exp.components import Component, facts_of
 from atlantis_exp.runs.folder import LOST
 from atlantis_exp.terminal import PROGRAM
@@ -76,13 +76,15 @@ def equal(facts: Facts) -> Iterator[str]:
 
 
 def modes_found(facts: Facts) -> Iterator[str]:
-    """Describe seeds that fall into two modes."""
-    for row in facts.tables["modes"]:
-        yield (
-            f"{row['group']} falls into two modes: {row['upper_share']:.0%} of its seeds score "
-            f"{row['upper_score']:,.0f} on average, the others {row['lower_score']:,.0f}; {row['time_cap_share']:.0%} "
-            f"of its episodes reach the time cap, at {row['points_per_frame']:.3g} points per frame."
-        )
+    """Describe seeds that fall into two modes: their mean is no score of either."""
+    for row in facts.tables["evaluation"]:
+        scores = group_of(facts.groups[row["group"]], facts.by).seeds
+        if (found := modes(list(scores.values()))) is not None:
+            yield (
+                f"{row['group']} falls into two modes: {found.share:.0%} of its seeds score {found.upper:,.0f} on "
+                f"average, the others {found.lower:,.0f}; {row['time_cap_share']:.0%} of its episodes reach the time "
+                f"cap, at {row['points_per_frame']:.3g} points per frame."
+            )
 
 
 def unlike(facts: Facts) -> Iterator[str]:
@@ -181,27 +183,12 @@ def moved_seeds(facts: Facts) -> Iterator[str]:
             )
 
 
-def unplanned(facts: Facts) -> Iterator[str]:
-    """Name looks at other numbers of seeds than planned."""
-    for answer in facts.answers:
-        before, planned = 0, answer.family.plan.looks
-        for look in answer.decision.looks:
-            if look.size not in planned:
-                late = [size for size in planned if before < size < look.size]
-                taken = (
-                    f"the look planned at {late[-1]} seeds was taken at {look.size}"
-                    if late
-                    else f"a look was taken at {look.size} seeds, where none was planned"
-                )
-                yield f"By {answer.family.name}, {taken}: it spent {look.error:.2%} of the error."
-            before = look.size
-
-
 def in_training(facts: Facts) -> Iterator[str]:
     """Name the group that leads in each view, if the intervals of its differences leave out zero."""
     outcomes: dict[str, list[str]] = defaultdict(list)
     views = facts.tables["views"]
-    for view in dict.fromkeys(row["view"] for row in views):
+    shown = dict.fromkeys(row["view"] for row in views)
+    for view in shown:
         rows = [row for row in views if row["view"] == view]
         if all(row["low"] > 0 for row in rows):
             outcomes[f"{rows[0]['leader']} leads at {{}}"].append(view)
@@ -209,17 +196,11 @@ def in_training(facts: Facts) -> Iterator[str]:
             outcomes["no lead is clear at {}, where an interval includes zero"].append(view)
         else:
             outcomes["nothing can be said of {}, for want of seeds"].append(view)
+    if len(facts.groups) > 1 and (missing := [view for view in AXES.values() if view not in shown]):
+        outcomes["nothing is known of {}, since a run has no such curve or too short a one"] = missing
     if outcomes:
         said = "; ".join(text.format(" and ".join(at)) for text, at in outcomes.items())
         yield f"In training, {said}: descriptions, not verdicts."
-
-
-def few_seeds(facts: Facts) -> Iterator[str]:
-    """Name groups that have too few seeds for a look."""
-    for label, runs in facts.groups.items():
-        seeds = len({run.config["seed"] for run in runs})
-        if seeds < FEWEST_SEEDS:
-            yield f"{label} has {seeds} of the {FEWEST_SEEDS} seeds without which nothing is decided."
 
 
 def mixed(facts: Facts) -> Iterator[str]:
@@ -265,14 +246,6 @@ def survival_and_rate(facts: Facts) -> Iterator[str]:
     )
 
 
-def missing_views(facts: Facts) -> Iterator[str]:
-    """Name views of the training that cannot be had."""
-    shown = {row["view"] for row in facts.tables["views"]}
-    missing = [name for name in AXES.values() if len(facts.groups) > 1 and name not in shown]
-    if missing:
-        yield f"Nothing is said of {' and '.join(missing)}: a run has no such learning curve, or one too short."
-
-
 def capped(facts: Facts) -> Iterator[str]:
     """Name groups whose scores the time cap decides."""
     if shares := [
@@ -308,13 +281,13 @@ def random_player(facts: Facts) -> Iterator[str]:
 
 CAVEATS: Sequence[Note] = (
     *(collapsed, lost_seeds, equal, modes_found, unlike, lossy, uncommitted),
-    *(unbalanced, later_seeds, moved_seeds, unplanned),
+    *(unbalanced, later_seeds, moved_seeds),
 )
 """What may make a verdict mean something else."""
 
 NOTES: Sequence[Note] = (
-    *(in_training, few_seeds, mixed, begun, survival_and_rate),
-    *(missing_views, capped, measured_players, random_player),
+    *(in_training, mixed, begun, survival_and_rate),
+    *(capped, measured_players, random_player),
 )
 """What is said after it."""
 

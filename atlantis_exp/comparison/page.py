@@ -22,118 +22,66 @@ def page(comparison: Comparison, figures: Mapping[str, Drawn], facts: Mapping[st
         shown_columns=shown_columns,
         label=label,
         cells=cells,
-        explained=EXPLAINED,
     )
 
 
-_EPISODES = {"episodes": "episodes", "mean": "mean", "median": "median", "low": "low", "high": "high"}
-_DIFFERENCE = {"difference": "difference", "said": "verdict"}
-
-COLUMNS = {
-    "scores": {"family": "by", "group": "group", "seeds": "seeds", "score": "mean of IQMs", **_DIFFERENCE},
-    "verdict": {"family": "by", "group": "group", "other": "against", **_DIFFERENCE, "seeds": "seeds each"},
-    "plan": {
-        "family": "by",
-        "planned": "looks planned at",
-        "taken": "taken at",
-        "next_look": "next look at",
-        "spent": "error spent",
-        "error": "of",
-    },
-    "looks": {
-        "family": "by",
-        "look": "look",
-        "seeds": "seeds each",
-        "spent": "error spent",
-        "group": "group",
-        "other": "against",
-        **_DIFFERENCE,
-    },
-    "evaluation": {
-        "group": "group",
-        "runs": "runs",
-        **_EPISODES,
-        "points_per_frame": "points per frame",
-        "time_cap_share": "at time cap",
-        "human_normalised_mean": "human-normalised",
-    },
-    "why": {
-        "group": "group",
-        "mean": "mean score",
-        "frames_mean": "frames an episode",
-        "time_cap_share": "at time cap",
-        "points_per_1000_frames": "points per 1,000 frames",
-    },
-    "modes": {
-        "group": "group",
-        "seeds": "seeds",
-        "upper_share": "in the upper mode",
-        "upper_score": "score of those",
-        "lower_score": "of the others",
-        "time_cap_share": "episodes at time cap",
-        "points_per_frame": "points per frame",
-    },
-    "views": {
-        "view": "view",
-        "at": "up to",
-        "leader": "leader",
-        "leader_score": "its score",
-        "other": "other",
-        "other_score": "its score",
-        "difference": "difference",
-    },
-    "improvement": {"group": "group", "over": "over", "probability": "probability of improvement"},
-    "runs": {
-        "run": "run",
-        "group": "group",
-        "seed": "seed",
-        "frames": "frames",
-        "hours": "hours",
-        "flops": "FLOPs",
-        "epsilon": "epsilon",
-        "score": "IQM",
-        **_EPISODES,
-        "policy": "policy",
-        "same_as": "plays as",
-    },
-    "actions": {"group": "group", "action": "action", "network": "network", "random": "chance"},
-    "references": {
-        "name": "player",
-        "score": "mean score",
-        "points_per_frame": "points per frame",
-        "protocol": "protocol",
-        "source": "source",
-    },
-    "skipped": {"run": "run", "reason": "why it is left out"},
+COLUMNS: Mapping[str, Sequence[str]] = {
+    "scores": ("family", "group", "seeds", "score", "difference", "said"),
+    "verdict": ("family", "group", "other", "difference", "said", "seeds"),
+    "plan": ("family", "planned", "taken", "next_look", "spent", "error"),
+    "looks": ("family", "look", "seeds", "spent", "group", "other", "difference", "said"),
+    "evaluation": (
+        *("group", "runs", "episodes", "mean", "median", "low", "high"),
+        *("points_per_frame", "time_cap_share", "human_normalised_mean"),
+    ),
+    "why": ("group", "mean", "frames_mean", "time_cap_share", "points_per_1000_frames"),
+    "views": ("view", "at", "leader", "leader_score", "other", "other_score", "difference"),
+    "improvement": ("group", "over", "probability"),
+    "runs": (
+        *("run", "group", "seed", "frames", "hours", "flops", "epsilon", "score"),
+        *("episodes", "mean", "median", "low", "high", "policy", "same_as"),
+    ),
+    "actions": ("group", "action", "network", "random"),
+    "references": ("name", "score", "points_per_frame", "protocol", "source"),
+    "skipped": ("run", "reason"),
 }
-"""The tables that the page shows: each column and its title."""
+"""The tables that the page shows, and their columns."""
 
-EXPLAINED = {
-    "by": "the key whose values are compared, averaged over the others",
-    "IQM": "the interquartile mean of a seed's evaluated episodes: the seed's score",
-    "mean of IQMs": "a group's score: the mean over its seeds of the interquartile means of their episodes",
-    "seeds each": "seeds of each of the two groups that the verdict rests on",
-    "verdict": "better, worse, equivalent within delta, or not decided",
-    "look": "a planned glance at the seeds so far, which spends a share of the error",
-    "error spent": "the share of the allowed probability of a false verdict that the looks have used up",
-    "of": "the allowed probability of any false verdict, over all pairs and looks",
-    "points per frame": "all points of the episodes over all their emulator frames, which no time cap distorts",
-    "points per 1,000 frames": "1,000 times all points of the episodes over all their emulator frames",
-    "at time cap": "the share of episodes that the limit of frames or steps ended",
-    "episodes at time cap": "the share of episodes that the limit of frames or steps ended",
-    "human-normalised": "0 % is the published random player, 100 % the published human",
-    "probability of improvement": "of an episode of the group and one of the other, how often the first scores higher",
-    "in the upper mode": "the share of seeds that survive where seeds fall into two modes",
-    "FLOPs": "floating-point operations of all gradient updates",
-    "epsilon": "the share of actions left to chance in evaluation",
-    "policy": "the action that the network chose most in evaluation; collapsed: it chose one only",
-    "plays as": "a run with the same score in every episode",
-    "chance": "the share of steps whose action was drawn at random",
+_TITLES = {
+    ("scores", "score"): "mean of IQMs",
+    ("runs", "score"): "IQM",
+    ("references", "score"): "mean score",
+    ("why", "mean"): "mean score",
+    ("views", "other"): "other",
+    **{(table, "seeds"): "seeds each" for table in ("verdict", "looks")},
 }
-"""A sentence on a title."""
+_TITLE = {
+    "family": "by",
+    "other": "against",
+    "said": "verdict",
+    "planned": "looks planned at",
+    "taken": "taken at",
+    "next_look": "next look at",
+    "spent": "error spent",
+    "error": "of",
+    "time_cap_share": "at time cap",
+    "human_normalised_mean": "human-normalised",
+    "frames_mean": "frames an episode",
+    "points_per_1000_frames": "points per 1,000 frames",
+    "at": "up to",
+    "leader_score": "its score",
+    "other_score": "its score",
+    "probability": "probability of improvement",
+    "flops": "FLOPs",
+    "same_as": "plays as",
+    "random": "chance",
+    "name": "player",
+    "reason": "why it is left out",
+}
+"""The titles of columns, in a table or in all, where the column's name is not its title."""
 
 SHARES = {
-    *("time_cap_share", "truncated_share", "random_share", "upper_share", "share", "probability", "network", "random"),
+    *("time_cap_share", "truncated_share", "random_share", "share", "probability", "network", "random"),
     *("human_normalised_mean", "error", "spent"),
 }
 """The columns that are shares and probabilities, from 0 to 1."""
@@ -147,7 +95,11 @@ _ENDS = {
 
 def label(name: str, column: str) -> str:
     """Return the title of a column."""
-    return COLUMNS.get(name, {}).get(column, column.replace("_", " "))
+    return (
+        _TITLES.get((name, column)) or _TITLE.get(column, column.replace("_", " "))
+        if name in COLUMNS
+        else column.replace("_", " ")
+    )
 
 
 def shown_columns(name: str, table: Table) -> list[str]:

@@ -1,4 +1,4 @@
-"""What others have scored in a game: what comes with it, with protocols and sources."""
+"""Read the published scores and curves that come with a game, with protocols and sources."""
 
 import csv
 import io
@@ -13,7 +13,7 @@ Table = list[Row]
 
 
 def scores(game: Component | None) -> Table:
-    """The published scores of a game, of players and algorithms, with sources; none where nobody says any."""
+    """Return the published scores of players and algorithms; none for a game without."""
     facts = facts_of(game)
     players = {"random player": facts.random_score, "human": facts.human_score}
     source = "dqn_zoo/atari_data.py (Quan and Ostrovski 2020)"
@@ -35,13 +35,13 @@ def scores(game: Component | None) -> Table:
 
 
 def _with_rate(row: Row) -> Row:
-    """Whoever survives plays as many frames as the cap allows; of anybody else it is the least that the rate can be."""
+    """Add points per frame, as if all frames that the cap allows were played: the least that the rate can be."""
     capped = row.pop("capped_frames", "")
     return {**row, "points_per_frame": row["score"] / float(capped) if capped else nan}
 
 
 def curves(game: Component | None) -> Table:
-    """The published learning curves of a game, with sources; none where nobody says any."""
+    """Return the published learning curves; none for a game without."""
     return [{**row, "frames": 1e6 * float(row.pop("frames_millions"))} for row in _read(game, "curves.csv")]
 
 
@@ -56,12 +56,12 @@ def _read(game: Component | None, name: str) -> Table:
 
 
 def random_line(references: Table) -> Row | None:
-    """The random player measured under the runs' own settings, else the published one, if there is one."""
+    """Return the random player measured under the runs' own settings, else the published one, if any."""
     return next((row for row in references if row["name"].startswith("random")), None)
 
 
 def early_dqn(game: Component | None) -> str:
-    """Why below random is no bug, from the published learning curves; empty where there are none."""
+    """Say why scores below random are normal early, from published learning curves; empty without any."""
     at = [row for row in curves(game) if row["name"].startswith("DQN") and row["frames"] == 5e6]
     if not at:
         return ""

@@ -3,7 +3,7 @@
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import combinations
 from math import isnan
@@ -19,7 +19,6 @@ from atlantis_exp.comparison.decision import (
     decide,
     equal_scores,
     mean_interval,
-    modes,
 )
 from atlantis_exp.comparison.gather import AXES, Array, Gathered, Player, Training
 from atlantis_exp.comparison.notes import CAVEATS, NOTES, Facts
@@ -77,7 +76,6 @@ def compare(
     named: list[tuple[str, dict[str, dict[int, float]], Answer | None]] = [
         (each.family.name, each.family.seeds, each) for each in answers
     ] or [("all", by_label, None)]
-    evaluation = [_evaluation(label, runs, game) for label, runs in groups.items()]
     tables: dict[str, Table] = {
         "scores": [row for family in named for row in _scores(*family)],
         "seeds": [
@@ -89,9 +87,8 @@ def compare(
         "verdict": [{"family": each.family.name, **_verdict(of)} for each in answers for of in each.decision.verdicts],
         "plan": [_plan(each) for each in answers],
         "looks": [row for each in answers for row in _looks(each)],
-        "evaluation": evaluation,
+        "evaluation": [_evaluation(label, runs, game) for label, runs in groups.items()],
         "why": [_why(label, runs, game.sources) for label, runs in groups.items()],
-        "modes": [row for row in evaluation for row in _modes(row, by_label[row["group"]])],
         "improvement": _improvement(groups),
         "views": _views(groups),
         "runs": [row for label, runs in groups.items() for row in _runs(label, runs)],
@@ -168,16 +165,7 @@ def _mean_interval(seeds: Sequence[float] | Array) -> tuple[float, float]:
 
 
 def _verdict(verdict: Verdict) -> Row:
-    return {
-        "group": verdict.group,
-        "other": verdict.other,
-        "said": verdict.said,
-        "difference": verdict.difference,
-        "low": verdict.low,
-        "high": verdict.high,
-        "seeds": verdict.seeds,
-        "detectable": _NAN if verdict.detectable is None else verdict.detectable,
-    }
+    return {**asdict(verdict), "detectable": _NAN if verdict.detectable is None else verdict.detectable}
 
 
 def _plan(answer: Answer) -> Row:
@@ -240,23 +228,6 @@ def _why(label: str, runs: Sequence[Training], sources: Sequence[str]) -> Row:
     }
 
 
-def _modes(evaluation: Row, seeds: Mapping[int, float]) -> Table:
-    """Return one row if a group's seeds fall into two modes: the share that survives, and both scores."""
-    if (found := modes(list(seeds.values()))) is None:
-        return []
-    return [
-        {
-            "group": evaluation["group"],
-            "seeds": len(seeds),
-            "upper_share": found.share,
-            "upper_score": found.upper,
-            "lower_score": found.lower,
-            "time_cap_share": evaluation["time_cap_share"],
-            "points_per_frame": evaluation["points_per_frame"],
-        }
-    ]
-
-
 def _runs(label: str, runs: Sequence[Training]) -> Table:
     alike = equal_scores({run.name: run.episodes.scores.tolist() for run in runs})
     same = {name: first for first, *others in alike for name in others}
@@ -284,12 +255,9 @@ def _runs(label: str, runs: Sequence[Training]) -> Table:
 
 
 def _improvement(groups: Groups) -> Table:
+    scores = {label: _pooled(runs) for label, runs in groups.items()}
     return [
-        {
-            "group": one,
-            "over": other,
-            "probability": probability_of_improvement(_pooled(groups[one]), _pooled(groups[other])),
-        }
+        {"group": one, "over": other, "probability": probability_of_improvement(scores[one], scores[other])}
         for one, other in combinations(groups, 2)
     ]
 
@@ -360,15 +328,9 @@ def _actions(label: str, runs: Sequence[Training]) -> Table:
 def _episodes(label: str, training: Training) -> Table:
     table = training.episodes
     rows = zip(table.scores.tolist(), table.steps.tolist(), table.truncated.tolist(), strict=True)
+    of = {"run": training.name, "group": label}
     return [
-        {
-            "run": training.name,
-            "group": label,
-            "episode": index,
-            "score": score,
-            "steps": int(steps),
-            "truncated": int(truncated),
-        }
+        {**of, "episode": index, "score": score, "steps": int(steps), "truncated": int(truncated)}
         for index, (score, steps, truncated) in enumerate(rows)
     ]
 

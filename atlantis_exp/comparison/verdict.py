@@ -1,8 +1,8 @@
-"""What is asked of groups of runs, and the answers: a decision for each family of pairs.
+"""Turn a question about groups of runs into families of pairs, and decide each.
 
 A seed's *score* is the interquartile mean of its evaluated episodes; a group's score is the mean over its seeds. No
-other quantity is decided about. `families` turns groups and a question into what is compared with what, `answer` takes
-the looks that are due, and `wanted` says which seeds the next looks need.
+other quantity is decided about. `families` says what is compared with what, `answer` takes the looks that are due, and
+`wanted` returns the seeds that the next looks need.
 """
 
 from collections import defaultdict
@@ -25,7 +25,7 @@ _SHORTEST_COMMIT = 4  # digits of a commit's name, as git itself wants them
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of groups, and the error that the whole answer may have."""
+    """A question about groups, and the error that the whole answer may have."""
 
     by: Sequence[str]  # keys
     seeds: int = 10  # a group, at the plan's last look
@@ -44,19 +44,19 @@ class Group:
 
     @property
     def label(self) -> str:
-        """What people call it."""
+        """Its name in sentences and tables."""
         return " ".join(self.values) or "all"
 
 
 @dataclass(frozen=True)
 class Family:
-    """What is compared with what: the values of one key, averaged over the groups of all others, or all groups."""
+    """Values that are compared: those of one key, averaged over the groups of all others, or all groups."""
 
     name: str  # the key, or all keys that differ
     plan: Plan
-    seeds: dict[str, dict[int, float]]  # of each value: one score a seed
-    groups: dict[str, list[Group]]  # of each value: what it is averaged over
-    left_out: list[str]  # labels of groups that not all values have the like of
+    seeds: dict[str, dict[int, float]]  # by value: one score a seed
+    groups: dict[str, list[Group]]  # by value: the groups that it is averaged over
+    left_out: list[str]  # labels of groups without a counterpart for every value
 
 
 @dataclass(frozen=True)
@@ -87,14 +87,14 @@ def group_of(runs: Sequence[Training], by: Sequence[str]) -> Group:
 
 
 def families(groups: Sequence[Group], question: Question) -> list[Family]:
-    """What a question compares, key by key; none where there is one group only.
+    """Return the families of a question; none for a single group.
 
-    Each key with several values is a family, whose values are averaged over the groups of the other keys at the same
-    seed: over those groups that all values have the like of, and the seeds that all of these have. Where several keys
+    Each key with several values is a family. Its values are averaged over the groups of the other keys at the same
+    seed: over those groups that every value has a counterpart of, and the seeds that all of these have. If several keys
     have several values, all groups are a family too. The question's error is divided equally among the families.
 
     Raises:
-        ConfigError: for a baseline that is none of what is compared.
+        ConfigError: if the baseline is not among what is compared.
     """
     keys = [index for index in range(len(question.by)) if len({group.values[index] for group in groups}) > 1]
     if not keys:
@@ -110,7 +110,7 @@ def families(groups: Sequence[Group], question: Question) -> list[Family]:
 
 
 def _averaged(groups: Sequence[Group], index: int) -> dict[str, list[Group]]:
-    """The groups that each value of a key is averaged over; empty where not all values have the like of any."""
+    """Return the groups that each value of a key is averaged over; empty if none has a counterpart for every value."""
     by_value: dict[str, dict[tuple[str, ...], Group]] = defaultdict(dict)
     for group in groups:
         by_value[group.values[index]][group.values[:index] + group.values[index + 1 :]] = group
@@ -124,7 +124,7 @@ def _baseline(
     keys: Sequence[int],
     question: Question,
 ) -> dict[str, str]:
-    """The family that has the baseline, and what it is called there."""
+    """Return the family that has the baseline, and its name there."""
     asked = question.baseline
     if asked is None:
         return {}
@@ -167,7 +167,7 @@ def _family(
 def answer(asked: Sequence[Family], record: Mapping[str, Sequence[Look]], now: bool = False) -> list[Answer]:
     """Take the looks that are due in each family, or with `now` one at the seeds there are.
 
-    Where a look decides some pairs, those that are left may have the seeds of the next one already.
+    Once a look has decided some pairs, the others may have the seeds of the next one already.
 
     Args:
         record: the looks taken before, by family.
@@ -184,9 +184,9 @@ def answer(asked: Sequence[Family], record: Mapping[str, Sequence[Look]], now: b
 
 
 def wanted(answers: Sequence[Answer]) -> dict[str, list[int]]:
-    """The seeds that each group lacks for the next look of every family that is not decided; empty where all are.
+    """Return the seeds that each group lacks for the next looks of undecided families; empty if all are decided.
 
-    They are the lowest that are not there, so that contenders share their seeds.
+    They are the lowest that are missing, so that contenders share their seeds.
     """
     lacking: dict[str, set[int]] = defaultdict(set)
     for family, decision in ((each.family, each.decision) for each in answers):

@@ -1,4 +1,4 @@
-"""A family's answer in a sentence or two, and where its looks stand."""
+"""Say a family's answer in a sentence or two, and where its looks stand."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ _LISTED = 6  # undecided pairs, up to which they are named
 
 
 def said(answer: Answer) -> str:
-    """What is decided and what is not; who is better comes first."""
+    """Say what is decided and what is not; the better ones come first."""
     verdicts = answer.decision.verdicts
     in_full = len(verdicts) <= _IN_FULL
     baseline = answer.family.plan.baseline
@@ -66,7 +66,7 @@ def _undecided(answer: Answer, verdicts: Sequence[Verdict]) -> str:
 
 
 def spent(answer: Answer) -> str:
-    """The looks that were planned and taken, and what they spent."""
+    """Say which looks were planned and taken, and the error spent."""
     plan, looks = answer.family.plan, answer.decision.looks
     return (
         f"looks planned at {' and '.join(map(str, plan.looks))} seeds; "
@@ -76,7 +76,7 @@ def spent(answer: Answer) -> str:
 
 
 def margin(plan: Plan) -> str:
-    """The plan's delta as a person writes it; empty without one."""
+    """Return the plan's delta as a person writes it; empty without one."""
     if plan.delta is None:
         return ""
     return f"{100 * plan.delta:g} %" if plan.relative else f"{_points(plan.delta)} points"
