@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 ONE_THREAD := OMP_NUM_THREADS=1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-all test-slurm lint ui clean
+.PHONY: help setup run test test-all test-slurm mutants lint ui clean
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -33,6 +33,9 @@ test-all: lint  ## every test, the slow ones too
 test-slurm: setup  ## a sweep on a real Slurm, where Debian's slurmctld, slurmd and slurm-client are installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[slurm]'
 	$(ONE_THREAD) $(BIN)/python -m pytest -q -rs -m '' tests/slurm
+
+mutants: setup  ## which small faults the quick tests notice, with a score; takes a night
+	$(ONE_THREAD) $(BIN)/python tests/mutants.py
 
 lint: setup  ## ruff and mypy --strict
 	$(BIN)/ruff check .

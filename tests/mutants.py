@@ -31,10 +31,14 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 MODULES = (
-    *("decision", "comparison.verdict", "learning.objectives", "replay.memory", "runs.journal"),
+    *("comparison.decision", "comparison.verdict", "learning.objectives", "replay.memory", "runs.journal"),
     *("training.checkpoint", "training.trainer", "sessions.sweep"),
 )
-ALSO = {"training.trainer": ("training.checkpoint",), "replay.memory": ("training.checkpoint",)}
+ALSO = {
+    "training.trainer": ("training.checkpoint",),
+    "replay.memory": ("training.checkpoint",),
+    "comparison.decision": ("comparison.verdict",),
+}
 LEAST = 0.9  # of a module's mutants
 OPERATORS: dict[type[ast.AST], tuple[type[ast.AST], ...]] = {
     ast.Lt: (ast.LtE, ast.GtE),
@@ -60,6 +64,7 @@ OPERATORS: dict[type[ast.AST], tuple[type[ast.AST], ...]] = {
     ast.BitOr: (ast.BitAnd,),
 }
 REMOVED = (ast.AugAssign, ast.Break, ast.Continue, ast.Delete, ast.For, ast.If, ast.Raise, ast.While)
+SYMMETRIC = ("array_equal", "max", "maximum", "min", "minimum", "swapaxes")
 UNREAD = {"annotation", "returns", "decorator_list", "bases"}  # no behaviour, or the module's own
 
 
@@ -88,6 +93,9 @@ def changed(node: ast.AST, in_function: bool) -> Iterator[ast.AST]:
         yield ast.Constant(not node.value if isinstance(node.value, bool) else node.value + 1)
     if not in_function:
         return
+    sides = (node.left, node.right) if isinstance(node, ast.BinOp) else ()
+    if any(isinstance(each, ast.Constant) and isinstance(each.value, str) for each in sides):
+        return  # a path or a text
     for field in ("op", "ops"):
         ops = getattr(node, field, None)
         for index, op in enumerate(ops if isinstance(ops, list) else [ops]):
@@ -102,15 +110,11 @@ def changed(node: ast.AST, in_function: bool) -> Iterator[ast.AST]:
         new = copy.copy(node)
         new.test = ast.UnaryOp(ast.Not(), test)  # type: ignore[attr-defined]
         yield new
-    if (
-        isinstance(node, ast.Call)
-        and len(node.args) > 1
-        and not any(isinstance(each, ast.Starred) for each in node.args)
-    ):
-        one, other_one, *others = node.args
-        if ast.unparse(one) != ast.unparse(other_one):
-            yield ast.Call(node.func, [other_one, one, *others], node.keywords)
-    if isinstance(node, ast.Return) and node.value is not None:
+    if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] not in SYMMETRIC:
+        texts = [ast.unparse(each) for each in node.args[:2] if not isinstance(each, ast.Starred)]
+        if len(set(texts)) == 2:
+            yield ast.Call(node.func, [*node.args[1::-1], *node.args[2:]], node.keywords)
+    if isinstance(node, ast.Return) and not isinstance(node.value, ast.Constant | None):
         yield ast.Return(ast.Constant(None))
     stored = (each for target in getattr(node, "targets", ()) for each in ast.walk(target))
     is_call = isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)
@@ -220,9 +224,8 @@ def run_mutated(module: str, tree: ast.Module, mutant: Mutant | None, tests: Seq
 def killed_of(module: str, sample: int, seed: int, folder: Path) -> dict[str, Any]:
     """Run a sample of a module's mutants, and print each with its fate."""
     path = ROOT / "atlantis_exp" / f"{module.replace('.', '/')}.py"
-    files = [
-        f"tests/{'/test_'.join(name.rpartition('.')[::2]).lstrip('/')}.py" for name in (module, *ALSO.get(module, ()))
-    ]
+    names = [name.rpartition(".") for name in (module, *ALSO.get(module, ()))]
+    files = [str(Path("tests", *package.split("."), f"test_{name}.py")) for package, _, name in names]
     watch = observed(path, files, folder)
     tree = ast.parse(path.read_text())
     listed = (Path(__file__).with_name("equivalent_mutants.txt")).read_text().splitlines()
@@ -230,10 +233,8 @@ def killed_of(module: str, sample: int, seed: int, folder: Path) -> dict[str, An
     mutants = [each for each in mutants_of(tree) if f"{module}: {each.change}" not in equivalent]
     chosen = random.Random(seed).sample(mutants, min(sample, len(mutants)))
     by_cost = sorted(watch.seconds, key=watch.seconds.__getitem__)
-    waiting: list[Mutant | None] = [
-        *sorted(chosen, key=lambda each: each.line)[::-1],
-        None,
-    ]  # first of all the original
+    waiting: list[Mutant | None] = sorted(chosen, key=lambda each: -each.line)
+    waiting.append(None)  # first of all the original
     running: dict[int, tuple[Mutant | None, float, Path]] = {}
     survivors: list[str] = []
     while waiting or running:
