@@ -90,7 +90,7 @@ def naive_steps(rows: Rows, error: float) -> tuple[set[tuple[int, int]], dict[tu
 @few
 @given(tables())
 def test_one_look_is_holms_procedure_on_scipys_welch_tests(rows: Rows) -> None:
-    assume((rows.std(axis=1) > 1).all())
+    assume((rows.std(axis=1) > 1).all() and not any(modes(row) for row in rows))
     rejected, tests = naive_steps(rows, 0.05)
     assume(all(abs(20 * pairs * test.pvalue - 1) > 1e-6 for test in tests.values() for pairs in range(1, 7)))
     decision = decide(seeds(rows), Plan(looks=(10,)))
@@ -438,7 +438,7 @@ def test_power_at_no_difference_is_the_error_of_the_last_look_and_seeds_end_wher
 
 
 def test_a_verdict_is_undone_by_the_collapse_that_makes_the_means_equal() -> None:
-    groups = seeds(np.array([[80.0, 84, 88, 92, 96], [44, 44.5, 45, 45.5, 46]]))
+    groups = seeds(np.array([[80.0, 84, 88, 92, 96], [43, 43.5, 44, 44.5, 45]]))
     decision = decide(groups, Plan(looks=(5,)))
     found = condition(decision.verdicts[0], decision.looks[0], groups)
     assert found.undone_by == pytest.approx(0.5)  # where half of 88 score nothing
@@ -471,29 +471,24 @@ def test_false_verdicts_of_groups_of_one_mean_and_different_shapes_are_strained(
     assert passed / 300 < 0.02
 
 
-@pytest.mark.parametrize("apart", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("apart", [0.5, 1.0])
 def test_the_size_found_overstates_no_more_than_it_understates(apart: float) -> None:
     rows = np.random.default_rng(7).normal(size=(1_000, 2, 5)) + np.array([[apart], [0.0]])
-    sizes, plain, plan = [], [], Plan(looks=(5,), error=0.05)
-    for each in rows:
-        decision = decide(seeds(each), plan)
-        if decision.verdicts[0].said != "not decided":
-            sizes.append(size_found(decision.verdicts[0], decision.looks[0]))
-            plain.append(decision.verdicts[0].difference)
-    low, middle, high = np.array(sizes).T
-    assert np.mean((low <= apart) & (apart <= high)) > 0.88
-    assert 0.35 < np.mean(middle < apart) < 0.75
-    assert abs(np.median(middle) - apart) < abs(np.median(plain) - apart)
-    assert (low <= middle).all()
-    assert (np.abs(middle) <= np.abs(plain)).all()
+    decisions = [decide(seeds(each), Plan(looks=(5,))) for each in rows]
+    decided = [each for each in decisions if each.verdicts[0].said != "not decided"]
+    sizes = np.array([size_found(each.verdicts[0], each.looks[0]) for each in decided])
+    plain = np.array([each.verdicts[0].difference for each in decided])
+    assert 0.4 < np.mean(sizes < apart) < 0.6
+    assert np.mean(plain < apart) < 0.1
+    assert (np.abs(sizes) <= np.abs(plain)).all()
 
 
 def test_the_size_of_a_sure_difference_is_the_difference_and_turns_with_it() -> None:
     for rows in (drawn(100, 0), drawn(0, 100)):
         decision = decide(seeds(rows), Plan(looks=(10,)))
-        (verdict,), (look,) = decision.verdicts, decision.looks
-        low, middle, high = size_found(verdict, look)
-        assert (low, middle, high) == pytest.approx((verdict.low, verdict.difference, verdict.high), rel=0.05)
+        assert size_found(decision.verdicts[0], decision.looks[0]) == pytest.approx(
+            decision.verdicts[0].difference, rel=0.03
+        )
 
 
 def test_the_best_may_be_any_group_that_none_is_better_than() -> None:
