@@ -1,7 +1,6 @@
 """The composition root: a checked config enters, a trainer or an evaluation made of built parts leaves."""
 
 import dataclasses
-import os
 import zlib
 from collections.abc import Callable
 from functools import partial
@@ -17,17 +16,17 @@ from torch import nn
 
 from atlantis_exp import config as cfg
 from atlantis_exp.checking import to_dict
-from atlantis_exp.components import Component, Method, admitted, describe, facts_of
+from atlantis_exp.components import Component, admitted, describe, facts_of, points_of
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.game.emulator import Emulator, check_game
 from atlantis_exp.game.preprocessing import FrameStack, Preprocessing
 from atlantis_exp.game.vector import Emulators, make_emulators
-from atlantis_exp.learning.allocation import keep_freed_memory
+from atlantis_exp.games import Game
 from atlantis_exp.learning.learner import Learner
+from atlantis_exp.learning.process import OWN_THREADS
 from atlantis_exp.learning.values import ActionValues
 from atlantis_exp.networks.dropout import seed_dropout
 from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
-from atlantis_exp.registry import Game
 from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.runs.folder import CHECKPOINTS
 from atlantis_exp.runs.journal import Tracker
@@ -38,8 +37,6 @@ from atlantis_exp.training.plan import Cadence, Phase, Plan
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.recorder import Recorder
 from atlantis_exp.training.trainer import Trainer
-
-_THREADS = torch.get_num_threads()  # torch's own choice, before anything here changes it
 
 OPTIMIZERS: dict[str, type[torch.optim.Optimizer]] = {
     "adamw": torch.optim.AdamW,
@@ -58,11 +55,7 @@ def build_game(component: Component) -> Game:
     game = facts_of(component)
     if component.plugin is not None:
         check_game(game)
-    if not game.sources:
-        return game
-    # What a plugin's file defines, a worker process cannot import.
-    points = component.load().points if component.plugin is None else Method(component, "points")
-    return dataclasses.replace(game, points=points)
+    return dataclasses.replace(game, points=points_of(component)) if game.sources else game
 
 
 def make_emulator(env: cfg.EnvConfig) -> partial[Emulator]:
@@ -82,19 +75,9 @@ def make_emulator(env: cfg.EnvConfig) -> partial[Emulator]:
     )
 
 
-def build_emulators(env: cfg.EnvConfig, num_envs: int, *, spare: int = 0) -> Emulators:
-    """`num_envs` emulators, one of them in this process, more in worker processes, which leave `spare` cores idle."""
-    return make_emulators(make_emulator(env), num_envs, env.workers or max(1, _cores() - spare))
-
-
-def _cores() -> int:
-    """How many cores are this process's: those that it may run on, and of these its share in OMP_NUM_THREADS.
-
-    That is where launchers (joblib, Ray, Slurm's scripts) say it, and where torch looks for its threads.
-    """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1  # macOS has none
-    share = os.environ.get("OMP_NUM_THREADS", "")
-    return min(cores, int(share)) if share.isdecimal() and int(share) else cores
+def build_emulators(env: cfg.EnvConfig, cores: int, num_envs: int) -> Emulators:
+    """Return emulators: a single one in this process, several in worker processes, as many as cores unless set."""
+    return make_emulators(make_emulator(env), num_envs, env.workers or cores)
 
 
 def choose_device(name: str) -> torch.device:
@@ -167,7 +150,9 @@ def _check_output(config: cfg.Config, network: nn.Module) -> None:
     with component.blamed(), torch.no_grad():
         made = tuple(network.eval()(torch.zeros(2, env.stack, env.size, env.size)).shape)
         if made != shape:
-            raise TypeError(f"{component.class_name} returns {made} for two states; it should be {shape}, the head's")
+            raise TypeError(
+                f"{component.load().__name__} returns {made} for two states; it should be {shape}, the head's"
+            )
 
 
 def _num_actions(config: cfg.Config) -> int:
@@ -229,7 +214,7 @@ def build_optimizer(optimizer: cfg.AdamConfig | cfg.RmsPropConfig, network: nn.M
 
 
 def build_learner(config: cfg.Config) -> Learner:
-    """Both networks, the optimizer, the objective; sets torch's threads for this process, and keeps memory it frees."""
+    """Return both networks with the optimizer and the objective."""
     device, target = choose_device(config.device), config.objective.target
     network = build_network(config, "network", device)
     target_network = build_network(config, "target", device)
@@ -244,22 +229,17 @@ def build_learner(config: cfg.Config) -> Learner:
         target_every=target.every,
         precision=choose_precision(config.training.precision, device),  # type: ignore[arg-type]
         target_mode=target.mode,
-        shards=_set_up_torch(config, device),
+        shards=choose_shards(config, device),
         ema=config.training.ema,
         compile=_compiled if config.compile else None,
     )
 
 
-def _set_up_torch(config: cfg.Config, device: torch.device) -> int:
-    """Set torch's threads in this process, let it keep freed memory and repeat its bits; the shards of a batch."""
-    keep_freed_memory()
-    torch.backends.cudnn.deterministic = True  # on a GPU, where else some kernels add in any order
-    torch.backends.cudnn.allow_tf32 = False  # there, fp32 is no TensorFloat-32 by another name
-    threads, component = config.threads or _THREADS, config.model.component
-    is_split = component is not None and component.facts["splits_batches"]
-    shards = threads if device.type == "cpu" and is_split else 1
-    torch.set_num_threads(threads // shards)
-    return shards
+def choose_shards(config: cfg.Config, device: torch.device) -> int:
+    """Return into how many parts a batch is cut: one a thread, on a processor where the network allows it."""
+    component = config.model.component
+    is_split = device.type == "cpu" and component is not None and component.facts["splits_batches"]
+    return (config.threads or OWN_THREADS) if is_split else 1
 
 
 def _compiled(network: nn.Module) -> nn.Module:
@@ -307,6 +287,8 @@ def build_trained_network(config: cfg.Config, weights: bytes) -> nn.Module:
             _architecture(config).load_state_dict(tensors, assign=True)
         network = build_network(config, "network")
         network.load_state_dict(tensors)
+        if not all(tensor.isfinite().all() for tensor in tensors.values()):
+            raise Fault("the weights are not all finite numbers: their training diverged, or they are damaged")
     except Fault:  # of a plugin
         raise
     except (SafetensorError, RuntimeError) as error:
@@ -319,7 +301,7 @@ def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Acto
     where = choose_device(device)
     network = build_trained_network(config, weights).to(where)
     precision = choose_precision(config.training.precision, where)
-    values = ActionValues(network, precision=precision, shards=_set_up_torch(config, where))  # type: ignore[arg-type]
+    values = ActionValues(network, precision=precision, shards=choose_shards(config, where))  # type: ignore[arg-type]
     return EpsilonGreedy(values.q_values, _num_actions(config), watches=True)
 
 
@@ -334,16 +316,19 @@ def build_baseline(agent: cfg.BaselineAgentConfig, env: cfg.EnvConfig) -> Actor:
     return RandomActor(len(facts_of(env.game).actions)) if agent.name == "random" else ConstantActor(agent.action)
 
 
-def build_evaluator(env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig) -> Evaluator:
-    """What evaluates any actor by this protocol."""
+def build_evaluator(env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig, cores: int) -> Evaluator:
+    """Return what evaluates any actor by this protocol."""
+    make = make_emulator(env)
+    workers = env.workers or max(1, cores - 1)  # one core is for the network, which decides meanwhile
     return Evaluator(
-        make_emulators=partial(build_emulators, env, spare=1),  # for the network's decisions, made meanwhile
-        make_emulator=make_emulator(env),
+        make_emulators=lambda num_envs: make_emulators(make, num_envs, workers),
+        make_emulator=make,
         epsilon=evaluation.epsilon,
         seed=evaluation.seed,
         num_envs=evaluation.at_once,
         size=env.size,
         stack=env.stack,
+        most_frames=env.max_frames,
         video="first_minute" if evaluation.video is True else evaluation.video or None,
     )
 
@@ -372,18 +357,23 @@ def build_cadence(evaluation: cfg.EvaluationConfig, tracking: cfg.TrackingConfig
     )
 
 
-def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: Progress, about: str = "") -> Trainer:
-    """All of a run; it writes under `folder` only. `about` opens its description, in markdown."""
+def build_trainer(
+    config: cfg.Config, cores: int, folder: Path, tracker: Tracker, progress: Progress, about: str = ""
+) -> Trainer:
+    """Return all of a run; it writes under `folder` only. `about` opens its description, in markdown."""
     env = config.env
     plan, learner, memory = build_plan(config), build_learner(config), build_memory(config)
-    num_actions = _num_actions(config)
-    watched = EpsilonGreedy(learner.evaluated_q_values, num_actions, watches=True)
-    evaluator = build_evaluator(env, config.evaluation)
+    evaluator, cadence = (
+        build_evaluator(env, config.evaluation, cores),
+        build_cadence(config.evaluation, config.tracking),
+    )
+    game = facts_of(config.game)
+    watched = EpsilonGreedy(learner.evaluated_q_values, len(game.actions), watches=True)
     return Trainer(
         plan=plan,
-        emulators=build_emulators(env, env.num_envs),
+        emulators=make_emulators(evaluator.make_emulator, env.num_envs, env.workers or cores),
         stack=FrameStack(env.num_envs, env.size, env.stack),
-        actor=EpsilonGreedy(learner.q_values, num_actions),
+        actor=EpsilonGreedy(learner.q_values, len(game.actions)),
         memory=memory,
         learner=learner,
         exploration=[np.random.default_rng(child) for child in stream(config.seed, "exploration").spawn(env.num_envs)],
@@ -391,14 +381,14 @@ def build_trainer(config: cfg.Config, folder: Path, tracker: Tracker, progress: 
         seeds=stream(config.seed, "emulators").generate_state(env.num_envs).tolist(),
         recorder=Recorder(
             plan=plan,
-            cadence=build_cadence(config.evaluation, config.tracking),
+            cadence=cadence,
             learner=learner,
             memory=memory,
             tracker=tracker,
             progress=progress,
             evaluate=partial(evaluator, watched),
             film=evaluator.film,
-            score_range=facts_of(config.game).score_range,
+            score_range=game.score_range,
             about=about,
         ),
         checkpoints=Checkpoints(folder / CHECKPOINTS, config.identity()),

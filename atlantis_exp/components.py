@@ -1,83 +1,126 @@
-"""Components by kind and name, ours and those of plugins: what a class takes, and what it says of itself.
+"""Components by kind and name: the classes that a config can name, ours and those of plugins.
 
-All of it is read from sources, never by importing them: a class is imported when it is built. Of plugins, those alone
-count that were admitted, which the command line does and nothing that is read from disk or from a server.
+A plugin is imported when it is admitted. Only the command line admits one, nothing that is read from disk or from a
+server. A class of ours is imported when it is built: `built_in` has what a config is checked by before torch is there.
 """
 
-import ast
 import hashlib
+import inspect
+import json
 import math
 import re
 import sys
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import MISSING, dataclass, fields
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
-from importlib.metadata import Distribution, PackageNotFoundError, distribution, distributions
-from importlib.util import module_from_spec, spec_from_loader
+from importlib.metadata import Distribution, PackageNotFoundError, distribution, entry_points
+from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
-from typing import Annotated, Any, Final, Literal
+from types import ModuleType, NoneType, UnionType
+from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from annotated_types import Interval
 from pydantic import TypeAdapter, ValidationError
 
 from atlantis_exp.checking import absolute, nearest
 from atlantis_exp.faults import ConfigError, Fault
-from atlantis_exp.registry import Game
-from atlantis_exp.registry import component as component
+from atlantis_exp.games import Game
+
+C = TypeVar("C", bound=type)
 
 ENTRY_POINTS: Final = "atlantis_exp.plugins"
 """The group of the entry points by which an installed distribution names its modules with components."""
 NAME: Final = r"^[a-z][a-z0-9_]{0,39}$"
-"""What a component and a setting may be called: run folders and config keys are made of it."""
+"""The form of a component's name and a setting's: they become run folders and config keys."""
 
-_OURS = Path(__file__).resolve().parent
-_PLACES = ("networks/*.py", "replay/samplers.py", "learning/objectives.py", "learning/schedules.py", "game/*.py")
-_MOST_BYTES = 1_000_000  # of a source
-_MOST_FILES = 10_000  # of a package
-_PLAIN = {"int": int, "float": float, "bool": bool, "str": str}
+# Ranges of settings.
+Count = Annotated[int, Interval(ge=1, le=10**12)]
+Positive = Annotated[float, Interval(gt=0, le=1_000)]
+Probability = Annotated[float, Interval(ge=0, le=1)]
+Share = Annotated[float, Interval(gt=0, lt=1)]
+# Types of our own settings whose classes need torch or numpy.
+Oversample = Annotated[int, Interval(ge=2, le=64)]
+Quantiles = Annotated[int, Interval(ge=1, le=1_000)]  # a sample of an update holds N x N differences
+Rescaling = Literal["signed_sqrt", "symlog"]
+
+
+@dataclass(frozen=True)
+class _NoFacts:
+    pass
+
+
+@dataclass(frozen=True)
+class _NetworkFacts:
+    input_size: int = 84  # pixels a side that it is made for
+    smallest_side: int = 1  # pixels
+    splits_batches: bool = False  # whether the output for a sample depends on that sample alone
+
+
+@dataclass(frozen=True)
+class _ObjectiveFacts:
+    head: Literal["plain", "quantile"] = "plain"  # of the network; plain includes dueling
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of component: what its constructor is given besides settings, and what its classes may say."""
+    """A kind of component: the contract of its classes."""
 
-    given: int = 0  # arguments, the first ones of the constructor
-    facts: Mapping[str, Any] | None = None  # class attributes, with the value of a class that is silent
+    given: int = 0  # arguments of the constructor ahead of the settings
+    facts: type = _NoFacts  # class attributes, with their defaults
+    methods: tuple[str, ...] = ()  # with their arguments
 
 
+_SCHEDULE: Final = Kind(methods=("__call__(progress, steps)",))
 KINDS: Final = {
-    "model": Kind(
-        given=3,  # input_shape, num_actions, head
-        facts={
-            "input_size": 84,  # pixels a side that it is made for
-            "smallest_side": 1,  # pixels
-            "splits_batches": False,  # whether what it makes of a sample depends on that sample alone
-        },
+    "model": Kind(given=3, facts=_NetworkFacts, methods=("forward(x)",)),  # input_shape, num_actions, head
+    "sampler": Kind(
+        methods=("sample(memory, batch_size, rng)", "feed_back(ids, errors)", "state_dict()", "load_state_dict(state)")
     ),
-    "sampler": Kind(),
-    "objective": Kind(facts={"head": "plain"}),  # that a network needs: plain, which dueling is too, or quantile
-    "epsilon": Kind(),
-    "lr_schedule": Kind(),
-    "env": Kind(facts={each.name: each.default for each in fields(Game) if each.name not in ("rom", "points")}),
+    "objective": Kind(
+        facts=_ObjectiveFacts,
+        methods=("targets(r_t, s_tpm, discount, online, target)", "losses(q, a_t, target)"),
+    ),
+    "epsilon": _SCHEDULE,
+    "lr_schedule": _SCHEDULE,
+    "env": Kind(facts=Game),
 }
-"""The kinds of components, which are config groups, too."""
+"""The kinds of components. Each is also a config group."""
 
 
 @dataclass(frozen=True)
 class Plugin:
-    """Where components come from that are not ours: a file, or an installed distribution."""
+    """A file or an installed distribution with components."""
 
     name: str  # of the file without its ending, or of the distribution
     version: str | None  # of the distribution
     sha256: str  # of the file, or of all of the package's
     shown: str  # as on the command line
+    roots: tuple[Path, ...]  # the file, or the folders of its packages
 
     def __str__(self) -> str:
         return describe(self.name, self.version, self.sha256)
+
+    @contextmanager
+    def blamed(self, place: str) -> Iterator[None]:
+        """Turn an error of the plugin's code into one line with its file and line, `place` where none is known.
+
+        Raises:
+            ConfigError: in place of any error but a Fault.
+        """
+        try:
+            yield
+        except Fault:
+            raise
+        except (Exception, SystemExit) as error:
+            frames = [(each.filename, each.lineno) for each in traceback.extract_tb(error.__traceback__)]
+            if isinstance(error, SyntaxError):
+                frames.append((error.filename or "", error.lineno))
+            own = [f"{name}:{line}" for name, line in frames if {Path(name), *Path(name).parents} & {*self.roots}]
+            reason = error.msg if isinstance(error, SyntaxError) else " ".join(str(error).split())
+            raise ConfigError(f"{own[-1] if own else place}: {type(error).__name__}: {reason}") from error
 
 
 @dataclass(frozen=True)
@@ -95,495 +138,353 @@ class Component:
 
     kind: str
     name: str
-    class_name: str
+    path: Path  # of its source
+    line: int
     settings: tuple[Setting, ...]
     facts: Mapping[str, Any]
-    source: "Source"
-    line: int
-
-    @property
-    def plugin(self) -> Plugin | None:
-        """The plugin that it is of; None where it is ours."""
-        return self.source.plugin
-
-    def load(self) -> type[Any]:
-        """Import the class. Raises: ConfigError where a plugin fails, naming file and line."""
-        with self.blamed():
-            loaded: type[Any] = getattr(self.source.load(), self.class_name)
-        return loaded
+    load: Callable[[], type[Any]]  # imports it
+    plugin: Plugin | None = None  # None: it is ours
 
     def data_path(self, name: str) -> Path:
-        """The path of a file that comes with it: of `pong` and `scores.csv`, `pong_scores.csv` next to it."""
-        return self.source.path.with_name(f"{self.name}_{name}")
+        """Return the path of a file that comes with it: of `pong` and `scores.csv`, `pong_scores.csv` next to it."""
+        return self.path.with_name(f"{self.name}_{name}")
 
-    @contextmanager
-    def blamed(self) -> Iterator[None]:
-        """Turn what a plugin's code raises into one line that names its file and line. Raises: ConfigError."""
-        try:
-            yield
-        except Fault:
-            raise
-        except (Exception, SystemExit) as error:
-            if self.plugin is None:
-                raise
-            lines = [
-                frame.lineno
-                for frame in traceback.extract_tb(error.__traceback__)
-                if frame.filename == str(self.source.path)
-            ]
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
-            raise ConfigError(f"{self.source.path}:{lines[-1] if lines else self.line}: {reason}") from error
+    def blamed(self) -> AbstractContextManager[None]:
+        """Turn an error of a plugin's code into one line with its file and line. Raises: ConfigError."""
+        return self.plugin.blamed(f"{self.path}:{self.line}") if self.plugin else nullcontext()
 
 
-@dataclass(frozen=True)
-class Method:
-    """A static method of a plugin's class that other processes can be sent: they load its source anew."""
+def component(name: str, *kinds: str) -> Callable[[C], C]:
+    """Name a plugin's class as a component of these kinds: `@component("mynet", "model")`."""
+    if not re.fullmatch(NAME, name):
+        raise ValueError(f"'{name}': a name has lowercase letters, digits and underscores, at most 40")
+    for kind in kinds or ("",):
+        if kind not in KINDS:
+            raise ValueError(f"'{kind}': no such kind; {nearest(kind, KINDS)}")
+    line = sys._getframe(1).f_lineno
 
-    component: Component
-    name: str
+    def named(cls: C) -> C:
+        cls.__component__ = name, kinds, line  # type: ignore[attr-defined]
+        return cls
 
-    def __call__(self, *given: Any) -> Any:
-        return getattr(self.component.load(), self.name)(*given)
-
-
-@dataclass(frozen=True)
-class Source:
-    """A module with components, as it is on disk."""
-
-    path: Path
-    text: bytes
-    module: str | None  # to import; None: it is a file alone, and its text is run
-    plugin: Plugin | None = None
-
-    def load(self) -> ModuleType:
-        """Import it, a file alone as the very text that was read and hashed."""
-        if self.module is not None:
-            return import_module(self.module)
-        assert self.plugin is not None
-        name = f"atlantis_exp_plugin_{self.plugin.name}"
-        loaded = sys.modules.get(name)
-        if loaded is not None and getattr(loaded, "__sha256__", None) == self.plugin.sha256:
-            return loaded
-        spec = spec_from_loader(name, loader=None, origin=str(self.path))
-        assert spec is not None
-        loaded = module_from_spec(spec)
-        loaded.__file__, loaded.__dict__["__sha256__"] = str(self.path), self.plugin.sha256
-        code = compile(self.text, str(self.path), "exec")
-        sys.modules[name] = loaded  # where dataclasses look for the types of their fields
-        try:
-            exec(code, loaded.__dict__)
-        except BaseException:
-            del sys.modules[name]
-            raise
-        return loaded
-
-    def components(self) -> list[Component]:
-        """The classes that `component` names. Raises: ConfigError with file and line for what cannot be read."""
-        try:
-            tree = ast.parse(self.text, str(self.path))
-        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-            line = getattr(error, "lineno", None) or 1
-            reason = getattr(error, "msg", None) or str(error) or type(error).__name__
-            raise ConfigError(f"{self.path}:{line}: {type(error).__name__}: {reason}") from None
-        try:
-            return [*_Reader(self, tree).components()]
-        except RecursionError:
-            raise ConfigError(f"{self.path}:1: a class or a type in it is made of itself") from None
+    return named
 
 
 def describe(name: str, version: str | None, sha256: str) -> str:
-    """What people call a plugin: `mynet 0.3, sha 1a2b3c4d5e6f`."""
+    """Return a plugin in words: `mynet 0.3, sha 1a2b3c4d5e6f`."""
     return f"{name}{f' {version}' if version else ''}, sha {sha256[:12]}"
 
 
 @cache
 def built_in() -> Mapping[tuple[str, str], Component]:
-    """Our own components by kind and name."""
-    sources = []
-    for path in sorted(path for place in _PLACES for path in _OURS.glob(place)):
-        module = ".".join(("atlantis_exp", *path.relative_to(_OURS).with_suffix("").parts))
-        sources.append(Source(path, path.read_bytes(), module))
-    return {(found.kind, found.name): found for source in sources for found in source.components()}
+    """Return our own components by kind and name."""
+    quantiles: dict[str, Any] = {"quantiles": Quantiles, "head": "quantile"}
+    ours = [
+        _ours("model", "cnn", "networks.cnn", "DQNCnn", smallest_side=36, splits_batches=True),
+        _ours("model", "cnn_small", "networks.cnn_small", "SmallCnn", smallest_side=20, splits_batches=True),
+        _ours("model", "resnet", "networks.resnet", "ResNetDQN", smallest_side=15),
+        _ours("model", "resnet_fast", "networks.resnet_fast", "ResNetFast", smallest_side=8, splits_batches=True),
+        _ours("sampler", "uniform", "replay.samplers", "UniformSampler"),
+        _ours("sampler", "top_half", "replay.samplers", "TopHalfSampler", oversample=Oversample),
+        _ours("sampler", "prioritized", "replay.samplers", "PrioritizedSampler", alpha=Probability, beta=Probability),
+        _ours("objective", "dqn", "learning.objectives", "DQN"),
+        _ours("objective", "double_dqn", "learning.objectives", "DoubleDQN"),
+        _ours("objective", "quantile", "learning.objectives", "Quantile", **quantiles),
+        _ours("objective", "double_quantile", "learning.objectives", "DoubleQuantile", **quantiles),
+        _ours("objective", "rescaled_double_dqn", "learning.objectives", "RescaledDoubleDQN", rescaling=Rescaling),
+        _ours(
+            *("objective", "rescaled_quantile", "learning.objectives", "RescaledQuantile"),
+            **quantiles,
+            rescaling=Rescaling,
+        ),
+        _ours("epsilon", "constant", "learning.schedules", "Constant"),
+        _ours("epsilon", "linear", "learning.schedules", "Linear"),
+        _ours("epsilon", "linear_steps", "learning.schedules", "LinearSteps"),
+        _ours("epsilon", "exponential", "learning.schedules", "Exponential"),
+        _ours("lr_schedule", "constant", "learning.schedules", "Constant"),
+        _ours("lr_schedule", "linear", "learning.schedules", "Linear"),
+        _ours("lr_schedule", "one_cycle", "learning.schedules", "OneCycle"),
+        _ours("env", "atlantis", "game.atlantis", "Atlantis"),
+    ]
+    return {(each.kind, each.name): each for each in ours}
 
 
-@dataclass(frozen=True)
-class _Admitted:
-    references: tuple[str, ...] = ()
-    components: Mapping[tuple[str, str], Component] | None = None
+def _ours(kind: str, name: str, module: str, class_name: str, **declared: Any) -> Component:
+    """Return a component of ours with its declared settings and facts; a schedule or game is light and is read."""
+
+    def load() -> type[Any]:
+        loaded: type[Any] = getattr(import_module(f"atlantis_exp.{module}"), class_name)
+        return loaded
+
+    if kind in ("epsilon", "lr_schedule", "env"):
+        settings, facts = read(kind, load())
+    else:
+        facts = {each.name: declared.pop(each.name, each.default) for each in fields(KINDS[kind].facts)}
+        settings = tuple(Setting(each, told, MISSING) for each, told in declared.items())
+    path = Path(__file__).parent.joinpath(*module.split(".")).with_suffix(".py")
+    return Component(kind, name, path, 1, settings, facts, load)
 
 
-_admitted = _Admitted()
+def read(kind: str, cls: type[Any]) -> tuple[tuple[Setting, ...], dict[str, Any]]:
+    """Return the settings and facts of a class. Raises: TypeError where it breaks the contract of its kind."""
+    named = [each for each in fields(KINDS[kind].facts) if each.name not in ("rom", "points")]
+    facts = {each.name: getattr(cls, each.name, each.default) for each in named}
+    return tuple(_settings(KINDS[kind].given, cls)), facts
+
+
+def _settings(count: int, cls: type[Any]) -> Iterator[Setting]:
+    arguments = [*inspect.signature(cls).parameters.values()]
+    given = [each for each in arguments if each.kind in (each.POSITIONAL_ONLY, each.POSITIONAL_OR_KEYWORD)]
+    if len(given) < count and not any(each.kind == each.VAR_POSITIONAL for each in arguments):
+        raise TypeError(f"__init__ takes {len(given)} arguments; it is given {count}")
+    types = get_type_hints(cls.__init__, include_extras=True)
+    for each in arguments:
+        if each in given[:count] or each.kind in (each.VAR_POSITIONAL, each.VAR_KEYWORD):
+            continue
+        if not re.fullmatch(NAME, each.name) or each.name in _TAKEN:
+            raise TypeError(
+                f"{each.name}: a setting has lowercase letters, digits and underscores, and is not one of "
+                f"{', '.join(_TAKEN)}"
+            )
+        if each.name not in types:
+            raise TypeError(f"{each.name}: has no type; write {each.name}: int")
+        if not _is_plain(types[each.name]):
+            raise TypeError(
+                f"{each.name}: {inspect.formatannotation(each.annotation)} is not a type of a setting; use int, "
+                "float, bool, str, Literal[...], tuple[...], one of these | None, Annotated[int, Interval(ge=1)]"
+            )
+        yield Setting(each.name, types[each.name], MISSING if each.default is each.empty else each.default)
+
+
+def _check(kind: str, cls: type[Any], settings: Sequence[Setting], facts: Mapping[str, Any]) -> None:
+    """Raise TypeError where a plugin's class would fail later: defaults, facts, the signatures of its methods."""
+    for each in settings:
+        if each.default is not MISSING:
+            try:
+                TypeAdapter(each.type).validate_json(json.dumps(each.default), strict=True)
+            except ValidationError as error:
+                raise TypeError(f"{each.name}: default {each.default!r}: {error.errors()[0]['msg']}") from None
+    for name, value in facts.items():
+        told = KINDS[kind].facts.__annotations__[name]
+        try:
+            TypeAdapter(told).validate_python(value, strict=True)
+        except ValidationError:
+            raise TypeError(f"{name}: should be a {inspect.formatannotation(told)}, not {value!r}") from None
+    for signature in KINDS[kind].methods:
+        method, *arguments = re.findall(r"\w+", signature)
+        found = next((vars(each)[method] for each in cls.__mro__ if method in vars(each)), None)
+        try:
+            inspect.signature(found).bind("self", *arguments)  # type: ignore[arg-type]
+        except TypeError:
+            raise TypeError(f"needs a method {method}({', '.join(['self', *arguments])})") from None
+    quantiles = {each.name: each.type for each in settings}.get("quantiles")
+    if facts.get("head") == "quantile" and getattr(quantiles, "__origin__", quantiles) is not int:
+        raise TypeError('head = "quantile" needs a setting quantiles: int, their number')
+    if kind == "env":
+        _check_game(cls, settings)
+
+
+def _check_game(cls: type[Any], settings: Sequence[Setting]) -> None:
+    if settings:
+        raise TypeError(f"{settings[0].name}: a game has no settings; they are those of conf/env")
+    for fact, example in (("actions", '("NOOP", "FIRE")'), ("score_range", "(0.0, 400.0)")):
+        if not hasattr(cls, fact):
+            raise TypeError(f"{fact}: missing; write {fact} = {example}")
+    low, high = cls.score_range
+    if not -math.inf < low < high < math.inf:
+        raise TypeError(f"score_range: should be the lowest and the highest score, not ({low}, {high})")
+    if getattr(cls, "sources", ()) and not hasattr(cls, "points"):
+        raise TypeError("sources: need a static method points(reward, ram) that returns what each has paid")
+
+
+def _is_plain(told: Any) -> bool:
+    """Return whether values of a type can be written in YAML and stored as JSON."""
+    parts = get_args(told)
+    match get_origin(told):
+        case None:
+            return told in (int, float, bool, str, NoneType, ...)
+        case origin if origin is Annotated:
+            return _is_plain(parts[0])
+        case origin if origin is Literal:
+            return all(isinstance(each, bool | int | float | str | None) for each in parts)
+        case origin:
+            return origin in (Union, UnionType, tuple) and all(map(_is_plain, parts))
+
+
+_TAKEN = ("component", "defaults", "name", "own", "settings")
+"""Keys that a config has for every component."""
+
+
+_references: tuple[str, ...] = ()
+_admitted: Mapping[tuple[str, str], Component] = {}
 
 
 def admit(references: Sequence[str]) -> None:
-    """Let the plugins that a command line names, and no others, count in this process; none is imported.
+    """Import the plugins that a command line names; they and no others count in this process.
 
     references: files, as ./mynet.py, or names of installed distributions. A file is read once, however often it is
-    admitted in a row: what changes amid a sweep counts from the next command on.
+    admitted in a row: a change during a sweep counts from the next command on.
 
     Raises:
-        ConfigError: for a plugin that cannot be read, and for a name that is taken.
+        ConfigError: for a plugin that cannot be imported or breaks a contract, and for a name that is taken.
     """
-    global _admitted
-    if (given := tuple(references)) == _admitted.references:
+    global _references, _admitted
+    if (given := tuple(references)) == _references:
         return
-    _admitted = _Admitted()
+    _references, _admitted = (), {}
     plugins: dict[str, str] = {}
     found: dict[tuple[str, str], Component] = {}
     for reference in given:
-        for source in _sources(reference):
-            assert source.plugin is not None
-            if (other := plugins.setdefault(source.plugin.name, reference)) != reference:
-                raise ConfigError(f"plugins={reference}: {other} is called {source.plugin.name}, too; rename one")
-            for each in source.components():
-                key = each.kind, each.name
-                if key in built_in():
-                    raise ConfigError(
-                        f"{source.path}:{each.line}: {each.kind}={each.name} is built in and is not replaced; "
-                        "give yours another name"
-                    )
-                if (taken := found.setdefault(key, each)) is not each:
-                    raise ConfigError(
-                        f"{source.path}:{each.line}: {each.kind}={each.name} is {taken.source.path}'s, too; "
-                        "give one of them another name"
-                    )
-        if not any(each.plugin and each.plugin.shown == reference for each in found.values()):
+        plugin, loads = _plugin(reference)
+        if (other := plugins.setdefault(plugin.name, reference)) != reference:
+            raise ConfigError(f"plugins={reference}: {other} is called {plugin.name}, too; rename one")
+        offered = [each for load in loads for each in _components(plugin, load)]
+        if not offered:
             raise ConfigError(
                 f'plugins={reference}: names no component; put @component("NAME", "KIND") before a class, '
                 f"KIND being one of {', '.join(KINDS)}"
             )
-    _admitted = _Admitted(given, found)
+        for each in offered:
+            where, what = f"{each.path}:{each.line}", f"{each.kind}={each.name}"
+            if (each.kind, each.name) in built_in():
+                raise ConfigError(f"{where}: {what} is built in and is not replaced; give yours another name")
+            taken = found.setdefault((each.kind, each.name), each)
+            if taken.load() is not each.load():
+                raise ConfigError(f"{where}: {what} is {taken.path}'s, too; give one of them another name")
+    _references, _admitted = given, found
 
 
 def admitted() -> Mapping[tuple[str, str], Component]:
-    """The components of the plugins that the command line names."""
-    return _admitted.components or {}
+    """Return the components of the plugins that the command line names."""
+    return _admitted
 
 
 def known(kind: str) -> dict[str, Component]:
-    """The components of a kind by name, ours and the admitted plugins'."""
+    """Return the components of a kind by name, ours and the admitted plugins'."""
     return {name: found for (of, name), found in {**built_in(), **admitted()}.items() if of == kind}
 
 
 def game_ids(name: str) -> tuple[str, str]:
-    """Gymnasium's two ids of a game: of `pong`, Pong-v0 and ALE/Pong-v5."""
+    """Return Gymnasium's two ids of a game: of `pong`, Pong-v0 and ALE/Pong-v5."""
     title = name.title().replace("_", "")
     return f"{title}-v0", f"ALE/{title}-v5"
 
 
 def game_of(env_id: str) -> Component | None:
-    """The game that one of Gymnasium's ids names; None where it is a plugin's that no command line names."""
+    """Return the game that one of Gymnasium's ids names, None where no admitted plugin has it."""
     return next((game for name, game in known("env").items() if env_id in game_ids(name)), None)
 
 
 def title_of(env_id: str) -> str:
-    """What people call the game of one of Gymnasium's ids: of ALE/Pong-v5, Pong."""
+    """Return the title of the game that one of Gymnasium's ids names: of ALE/Pong-v5, Pong."""
     return env_id.rpartition("/")[2].partition("-v")[0]
 
 
 def facts_of(game: Component | None) -> Game:
-    """What a game says of itself, without its code; of one that is not known, nothing."""
+    """Return the facts of a game without its code, no facts of an unknown one."""
     return Game() if game is None else Game(rom=game.name, **game.facts)
 
 
-def installed() -> dict[str, list[Component]]:
-    """What the distributions offer that are installed, by their names; nothing is imported.
+def points_of(game: Component) -> Callable[[int, Any], Sequence[float]]:
+    """Return the function that splits a frame's reward; worker processes can be sent it."""
+    cls = game.load()
+    points: Callable[[int, Any], Sequence[float]] = cls.points
+    text = vars(sys.modules[cls.__module__]).get("__text__")
+    return points if text is None else partial(_points, game.path, text, cls.__name__)
 
-    A distribution whose sources cannot be read offers nothing: whoever admits it reads why.
-    """
-    offered: dict[str, list[Component]] = {}
-    for each in distributions():
-        if each.entry_points.select(group=ENTRY_POINTS):
-            try:
-                sources = _sources_of(each.name, each)
-                offered[each.name] = [found for source in sources for found in source.components()]
-            except ConfigError:
-                continue
+
+def _points(path: Path, text: bytes, class_name: str, reward: int, ram: Any) -> Sequence[float]:
+    """Split a frame's reward in a process that cannot import the plugin's file."""
+    points: Sequence[float] = getattr(_load(path, text), class_name).points(reward, ram)
+    return points
+
+
+def _load(path: Path, text: bytes) -> ModuleType:
+    """Return a file's module, run once as the bytes that were read and hashed."""
+    name = f"atlantis_exp_plugin_{path.stem}"
+    own = {"__file__": str(path), "__text__": text}
+    if (loaded := sys.modules.get(name)) is not None and own.items() <= vars(loaded).items():
+        return loaded
+    loaded = ModuleType(name)
+    vars(loaded).update(own)
+    code = compile(text, str(path), "exec")
+    sys.modules[name] = loaded  # where dataclasses look for the types of their fields
+    try:
+        exec(code, vars(loaded))
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return loaded
+
+
+def installed() -> dict[str, list[str]]:
+    """Return the names of installed distributions' entry points, which are those of components; imports nothing."""
+    offered: dict[str, list[str]] = {}
+    for point in entry_points(group=ENTRY_POINTS):
+        if point.dist is not None:
+            offered.setdefault(point.dist.name, []).append(point.name)
     return offered
 
 
-def _sources(reference: str) -> list[Source]:
+def _components(plugin: Plugin, load: Callable[[], ModuleType]) -> Iterator[Component]:
+    """Import a module of a plugin and return its classes with `@component`."""
+    with plugin.blamed(f"plugins={plugin.shown}"):
+        module = load()
+    top = module.__name__.partition(".")[0]
+    for cls in vars(module).values():
+        # Not what it imports from elsewhere, and not what inherits from a component.
+        if isinstance(cls, type) and cls.__module__.partition(".")[0] == top and "__component__" in vars(cls):
+            name, kinds, line = vars(cls)["__component__"]
+            path = Path(str(sys.modules[cls.__module__].__file__))
+            for kind in kinds:
+                with plugin.blamed(f"{path}:{line}"):
+                    settings, facts = read(kind, cls)
+                    _check(kind, cls, settings, facts)
+                yield Component(kind, name, path, line, settings, facts, lambda cls=cls: cls, plugin)  # type: ignore[misc]
+
+
+def _plugin(reference: str) -> tuple[Plugin, list[Callable[[], ModuleType]]]:
+    """Return a plugin, not yet imported, and what imports its modules."""
     if "/" in reference or reference.endswith(".py"):
-        return [_file(reference)]
+        path = absolute("plugins", reference)
+        if not re.fullmatch(r"[A-Za-z_]\w{0,79}", path.stem, re.ASCII) or path.suffix != ".py":
+            raise ConfigError(f"plugins={reference}: write a file NAME.py, its name of letters, digits and underscores")
+        text = _read(reference, path)
+        plugin = Plugin(path.stem, None, hashlib.sha256(text).hexdigest(), reference, (path,))
+        return plugin, [partial(_load, path, text)]
     try:
         package = distribution(reference)
     except (PackageNotFoundError, ValueError):
-        names = {each.name for each in distributions() if each.entry_points.select(group=ENTRY_POINTS)}
+        names = installed()
         hint = nearest(reference, names) if names else "a file is written with its ending, as in ./mynet.py"
         raise ConfigError(f"plugins={reference}: no such distribution is installed; {hint}") from None
-    return _sources_of(reference, package)
+    return _package(reference, package)
 
 
-def _file(reference: str) -> Source:
-    path = absolute("plugins", reference)
-    if not re.fullmatch(r"[A-Za-z_]\w{0,79}", path.stem, re.ASCII) or path.suffix != ".py":
-        raise ConfigError(f"plugins={reference}: write a file NAME.py, its name of letters, digits and underscores")
-    text = _read(reference, path)
-    return Source(path, text, None, Plugin(path.stem, None, hashlib.sha256(text).hexdigest(), reference))
-
-
-def _sources_of(reference: str, package: Distribution) -> list[Source]:
-    """The modules that a distribution's entry points name, with the hash of the packages that hold them."""
-    points = package.entry_points.select(group=ENTRY_POINTS)
-    modules = sorted({point.module for point in points})
+def _package(reference: str, package: Distribution) -> tuple[Plugin, list[Callable[[], ModuleType]]]:
+    """Return a distribution with the hash of the packages that its entry points name."""
+    modules = sorted({point.module for point in package.entry_points.select(group=ENTRY_POINTS)})
     if not modules:
         raise ConfigError(f"plugins={reference}: it has no entry point in the group {ENTRY_POINTS}")
-    hashed = hashlib.sha256()
+    hashed, roots = hashlib.sha256(), []
     for top in sorted({module.partition(".")[0] for module in modules}):
-        path = _locate(reference, top)
-        files = sorted(path.parent.rglob("*.py")) if path.name == "__init__.py" else [path]
-        if len(files) > _MOST_FILES:
-            raise ConfigError(f"plugins={reference}: {path.parent} has more than {_MOST_FILES:,} sources")
-        for file in files:
+        spec = find_spec(top)  # imports nothing, since it has no parent
+        if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
+            raise ConfigError(f"plugins={reference}: its entry point names {top}, which is not there as source")
+        path = Path(spec.origin)
+        is_package = path.name == "__init__.py"
+        roots.append(path.parent if is_package else path)
+        for file in sorted(path.parent.rglob("*.py")) if is_package else [path]:
             hashed.update(f"{top}/{file.relative_to(path.parent)}\0".encode())
             hashed.update(hashlib.sha256(_read(reference, file)).digest())
-    plugin = Plugin(package.name, package.version, hashed.hexdigest(), reference)
-    paths = [_locate(reference, module) for module in modules]
-    return [Source(path, _read(reference, path), module, plugin) for path, module in zip(paths, modules, strict=True)]
-
-
-def _locate(reference: str, module: str) -> Path:
-    """Where a module's source is; its parents are not imported, as `importlib.util.find_spec` would."""
-    folders: Any = None
-    origin = None
-    parts = module.split(".")
-    for end in range(1, len(parts) + 1):
-        name = ".".join(parts[:end])
-        specs = (finder.find_spec(name, folders) for finder in sys.meta_path if hasattr(finder, "find_spec"))
-        if (spec := next((spec for spec in specs if spec is not None), None)) is None:
-            raise ConfigError(f"plugins={reference}: its entry point names {module}, which is not there")
-        folders, origin = spec.submodule_search_locations, spec.origin
-    if origin is None or not origin.endswith(".py"):
-        raise ConfigError(f"plugins={reference}: {module} has no source to read")
-    return Path(origin)
+    plugin = Plugin(package.name, package.version, hashed.hexdigest(), reference, tuple(roots))
+    return plugin, [partial(import_module, module) for module in modules]
 
 
 def _read(reference: str, path: Path) -> bytes:
+    if not path.is_file():
+        raise ConfigError(f"plugins={reference}: there is no file {path}")
     try:
-        if not path.is_file():
-            raise ConfigError(f"plugins={reference}: there is no file {path}")
-        with open(path, "rb") as file:
-            text = file.read(_MOST_BYTES + 1)
+        return path.read_bytes()
     except OSError as error:
         raise ConfigError(f"plugins={reference}: {error}") from None
-    if len(text) > _MOST_BYTES:
-        raise ConfigError(f"plugins={reference}: {path} has more than {_MOST_BYTES:,} bytes")
-    return text
-
-
-class _Reader:
-    """What a syntax tree says of the components in it."""
-
-    def __init__(self, source: Source, tree: ast.Module) -> None:
-        self._source = source
-        self._classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
-        self._aliases = {
-            target.id: node.value
-            for node in tree.body
-            if isinstance(node, ast.Assign)
-            for target in node.targets
-            if isinstance(target, ast.Name)
-        }
-
-    def components(self) -> Iterator[Component]:
-        for node in self._classes.values():
-            for decorator in node.decorator_list:
-                if isinstance(decorator, ast.Call) and _last(decorator.func) == "component":
-                    name, *kinds = self._names(decorator)
-                    for kind in kinds:
-                        settings = tuple(self._settings(node, KINDS[kind]))
-                        facts = self._facts(node, KINDS[kind].facts or {})
-                        types = {each.name: getattr(each.type, "__origin__", each.type) for each in settings}
-                        if facts.get("head") == "quantile" and types.get("quantiles") is not int:
-                            raise self._error(node, 'head = "quantile" needs a setting quantiles: int, their number')
-                        if kind == "env":
-                            self._check_game(node, settings, facts)
-                        yield Component(kind, name, node.name, settings, facts, self._source, node.lineno)
-
-    def _check_game(self, node: ast.ClassDef, settings: Sequence[Setting], facts: Mapping[str, Any]) -> None:
-        if settings:
-            raise self._error(node, f"{settings[0].name}: a game has no settings; they are those of conf/env")
-        for fact, example in (("actions", '("NOOP", "FIRE")'), ("score_range", "(0.0, 400.0)")):
-            if facts[fact] == KINDS["env"].facts[fact]:  # type: ignore[index]
-                raise self._error(node, f"{fact}: missing; write {fact} = {example}")
-        for each in fields(Game):
-            if each.name in facts:
-                told: Any = each.type
-                try:
-                    TypeAdapter(told).validate_python(facts[each.name], strict=True)
-                except ValidationError:
-                    raise self._error(node, f"{each.name}: should be a {each.type}") from None
-        low, high = facts["score_range"]
-        if not -math.inf < low < high < math.inf:
-            raise self._error(node, f"score_range: should be the lowest score and the highest, not ({low}, {high})")
-        if facts["sources"] and "points" not in self._members(node):
-            raise self._error(node, "sources: need a static method points(reward, ram), which says what each has paid")
-
-    def _members(self, node: ast.ClassDef) -> set[str]:
-        """The names of what a class defines or assigns, what it inherits from in this file included."""
-        members = [member for each in self._lineage(node) for member in each.body]
-        assigned = {_last(target) for member in members if isinstance(member, ast.Assign) for target in member.targets}
-        return assigned | {member.name for member in members if isinstance(member, ast.FunctionDef)}
-
-    def _names(self, call: ast.Call) -> list[str]:
-        names = [argument.value if isinstance(argument, ast.Constant) else None for argument in call.args]
-        if len(names) < 2 or call.keywords or not all(isinstance(name, str) for name in names):
-            raise self._error(call, 'write @component("NAME", "KIND"), both as plain strings')
-        name, *kinds = map(str, names)
-        if not re.fullmatch(NAME, name):
-            raise self._error(call, f"'{name}': a name is of small letters, digits and underscores, 40 at most")
-        for kind in kinds:
-            if kind not in KINDS:
-                raise self._error(call, f"'{kind}': no such kind; {nearest(kind, KINDS)}")
-        return [name, *kinds]
-
-    def _lineage(self, node: ast.ClassDef) -> list[ast.ClassDef]:
-        """A class and what it inherits from in this file, nearest last."""
-        bases = [self._classes[name] for base in reversed(node.bases) if (name := _last(base)) in self._classes]
-        above = [each for base in bases if base is not node for each in self._lineage(base)]
-        return [*dict.fromkeys(above), node]
-
-    def _settings(self, node: ast.ClassDef, kind: Kind) -> Iterator[Setting]:
-        lineage = self._lineage(node)
-        for each in reversed(lineage):
-            for member in each.body:
-                if isinstance(member, ast.FunctionDef) and member.name == "__init__":
-                    yield from self._arguments(member, kind)
-                    return
-        if kind.given == 0 and any(_last(each) == "dataclass" for above in lineage for each in above.decorator_list):
-            fields = {}
-            for each in lineage:
-                for member in each.body:
-                    if (
-                        isinstance(member, ast.AnnAssign)
-                        and isinstance(member.target, ast.Name)
-                        and _last(member.annotation) != "ClassVar"
-                    ):
-                        fields[member.target.id] = self._setting(
-                            member.target.id, member.annotation, member.value, member
-                        )
-            yield from fields.values()
-
-    def _arguments(self, init: ast.FunctionDef, kind: Kind) -> Iterator[Setting]:
-        positional = [*init.args.posonlyargs, *init.args.args][1:]
-        if len(positional) < kind.given and init.args.vararg is None:
-            raise self._error(init, f"__init__ takes {len(positional)} arguments; it is given {kind.given}")
-        padding: list[ast.expr | None] = [None] * (len(positional) - len(init.args.defaults))
-        defaults = [*padding, *init.args.defaults][-len(positional) :] if positional else []
-        given = [*zip(positional, defaults, strict=True)][kind.given :]
-        for argument, default in (*given, *zip(init.args.kwonlyargs, init.args.kw_defaults, strict=True)):
-            if argument.annotation is None:
-                raise self._error(argument, f"{argument.arg}: has no type; write {argument.arg}: int")
-            yield self._setting(argument.arg, argument.annotation, default, argument)
-
-    def _setting(self, name: str, annotation: ast.expr, default: ast.expr | None, node: ast.AST) -> Setting:
-        if not re.fullmatch(NAME, name) or name in _TAKEN:
-            taken = " or ".join(map(repr, _TAKEN))
-            raise self._error(node, f"{name}: a setting is of small letters, digits and underscores, and not {taken}")
-        try:
-            told = self._type(name, annotation)
-        except TypeError:  # Python's own, of Annotated[int] or None | None
-            raise self._no_type(name, annotation) from None
-        return Setting(name, told, MISSING if default is None else self._value(name, default))
-
-    def _facts(self, node: ast.ClassDef, silent: Mapping[str, Any]) -> dict[str, Any]:
-        facts = dict(silent)
-        for each in self._lineage(node):
-            for member in each.body:
-                targets = member.targets if isinstance(member, ast.Assign) else [getattr(member, "target", None)]
-                for target in targets:
-                    if not isinstance(target, ast.Name) or target.id not in silent:
-                        continue
-                    value = self._value(target.id, getattr(member, "value", None) or target)
-                    if type(value) is not type(silent[target.id]):
-                        raise self._error(target, f"{target.id}: should be as in {target.id} = {silent[target.id]!r}")
-                    facts[target.id] = value
-        if facts.get("head", "plain") not in ("plain", "quantile"):
-            raise self._error(node, f"head = {facts['head']!r}: no such head; {nearest(facts['head'], _HEADS)}")
-        return facts
-
-    def _value(self, name: str, node: ast.expr) -> Any:
-        try:
-            if _is_plain(value := ast.literal_eval(node)):
-                return value
-        except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
-            pass
-        raise self._error(node, f"{name}: its value should be a number, a text, None, or a tuple of them")
-
-    def _type(self, name: str, node: ast.expr) -> Any:
-        """An annotation as a type, from what it says alone."""
-        match node:
-            case ast.Constant(value=None):
-                return None
-            case ast.Constant(value=str(text)) if (said := _expression(text)) is not None:
-                return self._type(name, said)
-            case ast.Name(id=plain) if plain in _PLAIN:
-                return _PLAIN[plain]
-            case ast.Name(id=alias) if alias in self._aliases:
-                return self._type(name, self._aliases[alias])
-            case ast.BinOp(left=left, op=ast.BitOr(), right=right):
-                return self._type(name, left) | self._type(name, right)
-            case ast.Subscript(value=outer, slice=inside):
-                parts = inside.elts if isinstance(inside, ast.Tuple) else [inside]
-                match _last(outer):
-                    case "Literal":
-                        return Literal[tuple(self._value(name, part) for part in parts)]
-                    case "Optional":
-                        return self._type(name, parts[0]) | None
-                    case "tuple":
-                        inner = (... if _is_dots(part) else self._type(name, part) for part in parts)
-                        return tuple.__class_getitem__(tuple(inner))
-                    case "Annotated":
-                        ranges = [self._range(name, part) for part in parts[1:]]
-                        return Annotated[self._type(name, parts[0]), *ranges]
-        raise self._no_type(name, node)
-
-    def _no_type(self, name: str, node: ast.expr) -> ConfigError:
-        return self._error(
-            node,
-            f"{name}: {ast.unparse(node)} is no type of a setting; write int, float, bool, str, Literal[...], "
-            "tuple[...], one of them or None, or Annotated[int, Interval(ge=1, le=9)]",
-        )
-
-    def _range(self, name: str, node: ast.expr) -> Interval:
-        if isinstance(node, ast.Call) and _last(node.func) == "Interval" and not node.args:
-            bounds = {str(each.arg): self._value(name, each.value) for each in node.keywords}
-            if bounds.keys() <= {"gt", "ge", "lt", "le"}:
-                return Interval(**bounds)
-        raise self._error(node, f"{name}: {ast.unparse(node)} is no range; write Interval(ge=1, le=9), or gt, lt")
-
-    def _error(self, node: ast.AST, reason: str) -> ConfigError:
-        return ConfigError(f"{self._source.path}:{getattr(node, 'lineno', 1)}: {reason}")
-
-
-_HEADS = ("plain", "quantile")
-_TAKEN = ("component", "defaults", "name", "own", "settings")
-"""What a config says of every component, which no setting may be called."""
-
-
-def _last(node: ast.expr) -> str:
-    """The last part of a name: of `dataclasses.dataclass(frozen=True)`, `dataclass`."""
-    match node:
-        case ast.Name(id=name) | ast.Attribute(attr=name):
-            return name
-        case ast.Call(func=inner) | ast.Subscript(value=inner):
-            return _last(inner)
-    return ""
-
-
-def _is_plain(value: object) -> bool:
-    if isinstance(value, tuple):
-        return all(map(_is_plain, value))
-    return value is None or isinstance(value, bool | int | float | str)
-
-
-def _expression(text: str) -> ast.expr | None:
-    """An annotation that is written as a string; None where it is no expression."""
-    try:
-        return ast.parse(text, mode="eval").body
-    except (SyntaxError, ValueError, MemoryError, RecursionError):
-        return None
-
-
-def _is_dots(node: ast.expr) -> bool:
-    return isinstance(node, ast.Constant) and node.value is ...

@@ -19,22 +19,31 @@ from pydantic.dataclasses import dataclass
 from pydantic_core import PydanticKnownError
 
 from atlantis_exp.checking import check_server, check_time, digest, nearest, seconds, to_dict
-from atlantis_exp.components import KINDS, NAME, Component, Plugin, game_ids, game_of, known, title_of
+from atlantis_exp.components import (
+    KINDS,
+    NAME,
+    Component,
+    Count,
+    Plugin,
+    Probability,
+    game_ids,
+    game_of,
+    known,
+    title_of,
+)
 from atlantis_exp.faults import ConfigError
 
 # Built when a config is parsed: all verbs' together take a tenth of a second.
 STRICT = ConfigDict(defer_build=True, strict=True, extra="forbid", allow_inf_nan=False)
 
-Count = Annotated[int, Field(ge=1, le=10**12)]
 Frameskip = Annotated[int, Field(ge=1, le=256)]
 _MOST_GAMES = 64  # that an evaluation plays side by side
 Episodes = Annotated[int, Field(ge=1, le=10**6)]  # of one evaluation
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Size = Annotated[int, Field(ge=8, le=210)]
-Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
-Probability = Annotated[float, Field(ge=0, le=1)]
-Share = Annotated[float, Field(gt=0, lt=1)]
+Rate = Annotated[float, Field(ge=1e-10, le=10)]
+Scale = Annotated[float, Field(ge=1e-9, le=1e9)]
 
 
 def _check_device(device: str) -> str:
@@ -142,7 +151,7 @@ class ModelConfig(ComponentConfig):
 class TargetConfig:
     """The target network: how it starts, follows and normalises."""
 
-    tau: Annotated[float, Field(gt=0, le=1)]  # share of the policy network taken over
+    tau: Annotated[float, Field(ge=1e-6, le=1)]  # share of the policy network taken over; less is lost in float32
     every: Count  # updates
     mode: Literal["eval", "train"]
     start: Literal["copy", "independent"]
@@ -154,9 +163,9 @@ class ObjectiveConfig(ComponentConfig):
 
     gamma: Annotated[float, Field(ge=0, lt=1)]
     n_step: Annotated[int, Field(ge=1, le=1_000)]  # rewards before the bootstrap
-    reward_scale: Positive
+    reward_scale: Scale
     reward_exponent: Annotated[float, Field(gt=0, le=1)] = 1.0  # of what is scaled
-    reward_clip: Positive | None  # after both; null: not clipped
+    reward_clip: Scale | None  # after both; null: not clipped
     terminal_on_life_loss: bool
     target: TargetConfig
 
@@ -166,10 +175,10 @@ class AdamConfig:
     """Adam, or AdamW with decoupled weight decay."""
 
     name: Literal["adam", "adamw"]
-    lr: Positive
+    lr: Rate
     betas: tuple[Annotated[float, Field(ge=0, lt=1)], Annotated[float, Field(ge=0, lt=1)]]
-    eps: Positive
-    weight_decay: NonNegative
+    eps: Annotated[float, Field(ge=1e-20, le=1)]
+    weight_decay: Annotated[float, Field(ge=0, le=1)]
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -177,9 +186,9 @@ class RmsPropConfig:
     """RMSProp, centred as in the DQN papers when asked."""
 
     name: Literal["rmsprop"]
-    lr: Positive
+    lr: Rate
     alpha: Annotated[float, Field(ge=0, lt=1)]
-    eps: Positive
+    eps: Annotated[float, Field(ge=1e-20, le=1)]
     momentum: Annotated[float, Field(ge=0, lt=1)]
     centered: bool
 
@@ -296,7 +305,7 @@ class PhaseConfig:
 
     episodes: Count | None
     steps: Count | None
-    lr: Positive
+    lr: Rate
     sampler: str
 
 
@@ -309,10 +318,12 @@ class TrainingConfig:
     """When and on how much the learner learns."""
 
     learn_every: Count  # steps
-    learn_start: Annotated[int, Field(ge=0)]  # transitions in the memory
+    learn_start: Annotated[int, Field(ge=0, le=10**12)]  # transitions in the memory
     batch_size: Annotated[int, Field(ge=1, le=2**24)]  # transitions
     precision: Literal["auto", "fp32", "bf16"]
-    ema: Annotated[int, Field(ge=10)] | None = None  # updates over which evaluated weights are averaged; null: latest
+    ema: Annotated[int, Field(ge=10, le=10**7)] | None = (
+        None  # updates over which evaluated weights are averaged; null: latest
+    )
     weights: Annotated[str, Field(pattern=PINNED)] | None = None  # FOLDER@DIGEST of exported ones; null: random ones
 
     @property
@@ -362,7 +373,7 @@ class TrackingConfig:
     every_steps: Count  # steps between two points of a curve
     histogram_episodes: Count  # episodes in a window's score histogram
     commit_episodes: Count  # episodes between two checkpoints
-    commit_seconds: Positive  # seconds between two checkpoints at the most
+    commit_seconds: Annotated[float, Field(gt=0, le=1e9)]  # seconds between two checkpoints at the most
 
     def __post_init__(self) -> None:
         check_server("tracking.uri", self.uri)

@@ -1,4 +1,6 @@
-"""What a person can act on: mistakes and faults that end a command with one line instead of a traceback."""
+"""Mistakes and faults that end a command with one line, which a person can act on, instead of a traceback."""
+
+import errno
 
 
 class Fault(RuntimeError):
@@ -18,3 +20,10 @@ class ConfigError(Fault, ValueError):
 
     def __init__(self, message: str) -> None:
         super().__init__(message, exit_code=2)
+
+
+def remedied(error: Exception) -> str:
+    """Return an error's message, of a full disk with the key and the remedy."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return f"paths.outputs: {error}; make room there, or name another disk"
+    return str(error)

@@ -3,7 +3,7 @@
 import io
 import tempfile
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -110,53 +110,6 @@ def scene(
         if index == chosen:
             cv2.rectangle(picture, (328, y - min(18, pitch)), (552, y + min(24, pitch // 2)), colour, 2)
     return picture
-
-
-def curves(groups: Mapping[str, tuple[str, Sequence[Sequence[tuple[float, float]]]]], x: str, y: str) -> bytes:
-    """A PNG of curves, each run's thin and the mean of each group thick as far as all its runs go.
-
-    groups: by name, the colour and each run's points.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 4.5), dpi=110, layout="constrained")
-    axes = figure.add_subplot()
-    for name, (colour, runs) in groups.items():
-        for run in runs:
-            axes.plot(*np.reshape(run, (-1, 2)).T, color=colour, linewidth=0.8, alpha=0.5)
-        shared, means = _mean_curve([np.reshape(run, (-1, 2)).T for run in runs])
-        axes.plot(shared, means, color=colour, linewidth=2.5, label=f"{name} ({len(runs)})")
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
-    axes.legend(frameon=False, fontsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
-    return _png(figure)
-
-
-def _mean_curve(runs: Sequence[npt.NDArray[np.float64]]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """The mean of curves (x, y) where all of them are, at places of its own: theirs need not be the same."""
-    if not all(run.size for run in runs):
-        return np.empty(0), np.empty(0)
-    shared = np.linspace(max(run[0, 0] for run in runs), min(run[0, -1] for run in runs), 300)
-    if shared[-1] < shared[0]:
-        return np.empty(0), np.empty(0)
-    return shared, np.mean([np.interp(shared, *run) for run in runs], axis=0)
-
-
-def strips(groups: Mapping[str, tuple[str, Sequence[float]]], x: str) -> bytes:
-    """A PNG of numbers as dots, a row a group, with the mean of each as a line; groups: by name, colour and numbers."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 1.2 + 0.5 * len(groups)), dpi=110, layout="constrained")
-    axes = figure.add_subplot()
-    for row, (colour, numbers) in enumerate(groups.values()):
-        axes.plot(numbers, [row] * len(numbers), "o", color=colour, markersize=7, alpha=0.8)
-        axes.plot([np.mean(numbers)] * 2, [row - 0.3, row + 0.3], color=colour, linewidth=2.5)
-    axes.set_yticks(range(len(groups)), list(groups))
-    axes.set_ylim(len(groups) - 0.5, -0.5)
-    axes.set_xlabel(x)
-    axes.spines[["top", "right"]].set_visible(False)
-    return _png(figure)
 
 
 def film(pictures: Iterable[npt.NDArray[np.uint8]], frames_per_second: float) -> bytes:

@@ -1,6 +1,6 @@
 """What sets of episode scores say, and how surely."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,10 +63,11 @@ def interquartile_mean(scores: Scores) -> float:
     )
 
 
-def resample(seeds: Sequence[Scores], resamples: int, rng: np.random.Generator) -> list[Scores]:
-    """Bootstrap samples of episodes that come by seeds: seeds are drawn with replacement, then each one's episodes.
+def resample(seeds: Sequence[Scores], resamples: int, rng: np.random.Generator) -> Iterator[Scores]:
+    """Draw bootstrap samples of episodes that come by seeds: seeds with replacement, then each one's episodes.
 
-    Every returned array pools the episodes of as many seeds as there are. Raises ValueError without a seed.
+    Each pools the episodes of as many seeds as there are; only one at a time is in memory. Raises: ValueError without
+    a seed.
     """
     if not seeds:
         raise ValueError("a bootstrap needs at least one seed")
@@ -79,7 +80,7 @@ def resample(seeds: Sequence[Scores], resamples: int, rng: np.random.Generator) 
         size = sizes[chosen]
         return pool[np.repeat(starts[chosen], size) + rng.integers(np.repeat(size, size))]
 
-    return [drawn() for _ in range(resamples)]
+    return (drawn() for _ in range(resamples))
 
 
 def interval(estimates: Sequence[float] | Sequence[Scores] | Scores) -> npt.NDArray[np.float64]:

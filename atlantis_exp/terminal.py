@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 
 from rich.console import Console
@@ -13,7 +14,7 @@ from rich.console import Console
 _HERE = Path(__file__).parent
 PROGRAM = "atlantis-exp" if (_HERE / "conf").is_dir() else "python -m atlantis_exp"
 """What a person calls: an installed wheel, which brings the config groups, by the name of its command."""
-LINE_SECONDS = 4.0  # between two lines of what is under way: nothing is silent for five
+LINE_SECONDS = 4.0  # before the first line of what is under way: nothing begins with five seconds of silence
 _FIRST_SECONDS = 1.0  # what takes less needs no line
 
 
@@ -35,6 +36,11 @@ def warn(text: str) -> None:
     print(f"atlantis_exp: {harmless(text)}".replace("\n", " "), file=sys.stderr, flush=True)
 
 
+def until_line(lines: int) -> float:
+    """Return the seconds before the next line of what is under way, after so many: 4, 8, 16, then 30 each."""
+    return min(LINE_SECONDS * 2.0 ** min(lines, 3), 30.0)
+
+
 @contextmanager
 def working(what: str, how_far: Callable[[], str] = str) -> Iterator[None]:
     """Say what is under way, and how far: in a changing line on a terminal, elsewhere in a line every few seconds.
@@ -51,9 +57,10 @@ def working(what: str, how_far: Callable[[], str] = str) -> Iterator[None]:
             return
         if not shown.is_terminal:
             shown.print(line())
-            while not ended.wait(LINE_SECONDS):
+            for lines in count():
+                if ended.wait(until_line(lines)):
+                    return
                 shown.print(line())
-            return
         with shown.status(line()) as status:
             while not ended.wait(0.25):
                 status.update(line())

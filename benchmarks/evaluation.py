@@ -24,6 +24,7 @@ from rich.console import Console
 
 from atlantis_exp.build import build_evaluator, make_emulator
 from atlantis_exp.game.vector import SerialEmulators
+from atlantis_exp.machine import here
 from atlantis_exp.sessions.cards import build_exported_actor, read_card
 from atlantis_exp.training.actor import Actor
 from atlantis_exp.training.evaluation import Stopped
@@ -44,7 +45,7 @@ def player(folder: str, num_envs: int, max_steps: int | None = None) -> tuple[Ac
     card, weights = read_card(Path(folder))
     env = card.config.env if max_steps is None else replace(card.config.env, max_steps=max_steps)
     evaluation = replace(card.evaluation, num_envs=num_envs, video="all")
-    return build_exported_actor(card.config, weights, "cpu"), build_evaluator(env, evaluation)
+    return build_exported_actor(card.config, weights, "cpu"), build_evaluator(env, evaluation, here().cores)
 
 
 @contextmanager

@@ -52,7 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Kill, compare, print."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.kills")
     parser.add_argument("--kills", type=int, default=1_000)
-    parser.add_argument("--only", choices=[*TRAININGS, SWEEP], action="append")
+    parser.add_argument("--only", choices=[*TRAININGS, SWEEP], action="append", help="sweep is one on joblib")
+    parser.add_argument("--early", type=float, default=0.0, help="share of the kills while a session starts")
     options = parser.parse_args(arguments)
     _FORKS.set_forkserver_preload(["atlantis_exp.commands.train", "atlantis_exp.sessions.training"])
     names = options.only or [*TRAININGS, SWEEP]
@@ -64,14 +65,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         unbroken = {}
         for name in names:
             with terminal.working(f"unbroken: {name}"):
-                _, unbroken[name] = _killed(name, Path(folder, name), 0)
+                _, unbroken[name] = _killed(name, Path(folder, name), 0, 0.0)
             console.print(f"unbroken: {name}, {len(unbroken[name])} fingerprints")
         for copy, name in enumerate(itertools.cycle(names)):
             if (left := options.kills - sum(struck.values())) <= 0:
                 break
             place = Path(folder, f"{name}-{copy}")
             with terminal.working(f"copy {copy}: {name}", partial(_so_far, place)):
-                kills, prints = _killed(name, place, min(left, _KILLS_OF_ONE.get(name, left)))
+                kills, prints = _killed(name, place, min(left, _KILLS_OF_ONE.get(name, left)), options.early)
             struck[name] += kills
             console.print(f"copy {copy}: {name}, killed {kills} times; {sum(struck.values()):,} of {options.kills:,}")
             parts = sorted({part for part, _ in prints.items() ^ unbroken[name].items()})
@@ -88,19 +89,19 @@ def _so_far(outputs: Path) -> str:
     return f"{generations(outputs, '*')} commits"
 
 
-def _killed(name: str, outputs: Path, kills: int) -> tuple[int, dict[str, str]]:
+def _killed(name: str, outputs: Path, kills: int, early: float) -> tuple[int, dict[str, str]]:
     """Train one of them to its end, with kills on the way; how many struck, and its fingerprints."""
     place = f"paths.outputs={outputs}"
     if name == SWEEP:
         launcher = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
         words = replaced(SMALL, "seed=0,1", "tracking.commit_seconds=0.5", place)
         command = (sys.executable, "-m", "atlantis_exp", "train", "-m", *launcher, *words)
-        struck = run_and_kill(lambda said: start(command, said), outputs, "*", kills)
+        struck = run_and_kill(lambda said: start(command, said), outputs, "*", kills, early=early)
         configs = {f"seed {seed}: ": composed(*replaced(SMALL, f"seed={seed}")) for seed in (0, 1)}
     else:
         words = replaced(SMALL, *TRAININGS[name], place)
         configs = {"": composed(*words)}
-        struck = run_and_kill(lambda said: _Fork(words, said), outputs, "*", kills, _SECONDS)
+        struck = run_and_kill(lambda said: _Fork(words, said), outputs, "*", kills, _SECONDS, early)
     prints = {label: fingerprints(config, outputs) for label, config in configs.items()}
     return struck, {f"{label}{part}": value for label, parts in prints.items() for part, value in parts.items()}
 

@@ -20,6 +20,7 @@ from atlantis_exp import terminal
 from atlantis_exp.build import build_learner, choose_device, choose_precision
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
+from atlantis_exp.sessions.processor import set_up_torch
 from benchmarks.composition import composed
 from benchmarks.contest import calls_per_second, print_results, print_table, take_turns
 
@@ -47,6 +48,7 @@ CASES = tuple(Case(*network, precision) for network in (("cnn", 128), ("resnet",
 
 def update_of(config: Config) -> Callable[[], object]:
     """An update of a learner on a batch of noise; sets torch's threads to what the learner has in a training."""
+    set_up_torch(config, config.device)
     learner, batch_size = build_learner(config), config.training.batch_size
     rng = np.random.default_rng(0)
     # As the replay memory hands them over: frame by frame, seen as state by state.

@@ -21,8 +21,9 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from atlantis_exp.components import facts_of, game_of
-from atlantis_exp.runs.journal import Journal, NullJournal, Tracker
-from atlantis_exp.tracking.store import Publisher, Store
+from atlantis_exp.runs.journal import Journal, Tracker
+from atlantis_exp.tracking.publishing import Publisher
+from atlantis_exp.tracking.store import Store
 from atlantis_exp.training.evaluation import Episode, Evaluation
 from atlantis_exp.training.trainer import Trainer
 from benchmarks.composition import composed
@@ -78,7 +79,7 @@ def training(tracked: bool, commit_seconds: float) -> Iterator[Measure[Turn]]:
 
     def tracker_of(folder: Path) -> Tracker:
         if not tracked:
-            return NullJournal()
+            return Tracker()
         journal = Journal(folder)
         publishers.append(Publisher(folder, Store(folder / "store", "overhead")))
         return journal

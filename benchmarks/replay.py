@@ -24,6 +24,7 @@ from atlantis_exp.build import build_learner, make_emulator
 from atlantis_exp.config import EnvConfig
 from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.replay.samplers import UniformSampler
+from atlantis_exp.sessions.processor import set_up_torch
 from benchmarks.composition import composed
 from benchmarks.contest import calls_per_second, missing, print_results, print_table, take_turns
 
@@ -126,6 +127,7 @@ def measure_share(model: str, steps: int, transitions: int, rounds: int, seconds
     memory = ReplayMemory(transitions + transitions // 100 + 5, (size, size), budget_bytes=config.replay.max_bytes)
     with terminal.working(f"filling the memory of {model}"):
         fill(memory, list(random_play(config.env, steps)), transitions)
+    set_up_torch(config, config.device)
     learner = build_learner(config)
     rng = np.random.default_rng(1)
     batch = memory.gather(memory.draw(BATCHES[model], rng), RETURNS)

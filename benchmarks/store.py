@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import json
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -21,12 +22,12 @@ from atlantis_exp.commands.overrides import check
 from atlantis_exp.commands.report import VERB as REPORT
 from atlantis_exp.commands.sync import VERB as SYNC
 from atlantis_exp.components import facts_of
-from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import Result, RunFolder, evaluation_at
 from atlantis_exp.runs.journal import Commit, commit_bytes, read_commit
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.sweep import ledger
-from atlantis_exp.tracking.store import Cursor, Store, files_digest, small_files
+from atlantis_exp.tracking.mirror import PRIMARY, Cursor, digest
+from atlantis_exp.tracking.store import Store
 from atlantis_exp.training.evaluation import Episode, Evaluation
 from benchmarks.composition import composed
 
@@ -114,18 +115,17 @@ def work_of(verb: Verb[Any], *overrides: str) -> Callable[[], object]:
 
 
 def publish_nothing(outputs: Path) -> None:
-    """Note in every run's folder that the local store has it."""
-    address = Store(outputs).address
+    """Note in every run's folder that the local store has it, which has a run without points."""
+    store = Store(outputs)
     for path in outputs.glob("runs/*/commit.json"):
         folder = path.parent
         if (commit := read_commit(folder)) is not None:
-            digest = files_digest(small_files(folder, commit, is_server=False))
-            note = Cursor(address, commit.identity, "0" * 32, commit.offset, digest)
-            write_file(folder / "published.json", json.dumps(dataclasses.asdict(note)).encode())
+            run_id = store.open_run(folder, commit).info.run_id
+            Cursor(store.address, commit.identity, run_id, commit.offset, digest(commit)).save(folder / PRIMARY)
 
 
-def measure(command: Callable[[], object]) -> tuple[float, float]:
-    """Seconds and peak resident MiB of a command in a process of its own, which is forked after the imports."""
+def measure(command: Callable[[], object]) -> tuple[float, float, float]:
+    """Return seconds, processor seconds and peak resident MiB of a command in a process forked after the imports."""
     start = time.perf_counter()
     child = os.fork()
     if child == 0:
@@ -140,7 +140,21 @@ def measure(command: Callable[[], object]) -> tuple[float, float]:
     _, status, usage = os.wait4(child, 0)
     if status:
         raise SystemExit("the command failed")
-    return time.perf_counter() - start, usage.ru_maxrss / 1024
+    return time.perf_counter() - start, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024
+
+
+def measure_publishing(runs: Path, outputs: Path) -> None:
+    """Publish copies of run folders in a new store and print what it costs, as a table and one line of JSON."""
+
+    def sync() -> None:
+        work_of(SYNC, f"paths.outputs={outputs}")()
+
+    Store(outputs / "another").runs()  # the imports
+    measure(sync)  # the tables
+    copies = [shutil.copytree(run, outputs / "runs" / run.name) for run in sorted(runs.iterdir())]
+    seconds, processor, _ = measure(sync)
+    print(f"sync of {len(copies)} runs: {seconds:.1f} s, {processor / len(copies):.3f} s of processor time a run")
+    print(json.dumps({"runs": len(copies), "sync_s": round(seconds, 2), "processor_s": round(processor, 2)}))
 
 
 def main(arguments: Sequence[str] = ()) -> None:
@@ -149,9 +163,13 @@ def main(arguments: Sequence[str] = ()) -> None:
     parser.add_argument("--runs", type=int, default=1_000)
     parser.add_argument("--episodes", type=int, default=20_000)
     parser.add_argument("--distinct", type=int, default=20, help="journals; the other runs link to them")
+    parser.add_argument("--publish", type=Path, help="a folder of runs: measure only what publishing copies costs")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="store-", dir=".") as place:
         outputs = Path(place).resolve()
+        if options.publish:
+            measure_publishing(options.publish, outputs)
+            return
         with terminal.working("writing the runs"):
             jobs = write_runs(outputs, options.runs, options.episodes, options.distinct)
         size = (RunFolder.of(jobs[0].config).path / "journal.jsonl").stat().st_size
@@ -172,10 +190,10 @@ def main(arguments: Sequence[str] = ()) -> None:
         results = {name: measure(command) for name, command in commands.items()}
     print(f"{options.runs:,} runs of {options.episodes:,} episodes, journals of {size / 2**20:.1f} MiB\n")
     print(f"{'command':12}{'seconds':>10}{'peak MiB':>10}")
-    for name, (seconds, peak) in results.items():
+    for name, (seconds, _, peak) in results.items():
         print(f"{name:12}{seconds:>10.1f}{peak:>10.0f}")
-    figures = {f"{name}_s": round(seconds, 2) for name, (seconds, _) in results.items()}
-    peaks = {f"{name}_mib": round(peak) for name, (_, peak) in results.items()}
+    figures = {f"{name}_s": round(seconds, 2) for name, (seconds, _, _) in results.items()}
+    peaks = {f"{name}_mib": round(peak) for name, (_, _, peak) in results.items()}
     print(json.dumps({"runs": options.runs, "episodes": options.episodes, "journal_bytes": size, **figures, **peaks}))
 
 

@@ -27,7 +27,9 @@ from rich.console import Console
 
 from atlantis_exp.build import build_evaluator, build_trainer
 from atlantis_exp.config import Config
-from atlantis_exp.runs.journal import NullJournal
+from atlantis_exp.machine import here
+from atlantis_exp.runs.journal import Tracker
+from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.training.actor import EpsilonGreedy, States
 from atlantis_exp.training.progress import Progress
 from benchmarks.composition import composed
@@ -63,7 +65,7 @@ class Judge:
         """The mean score in a config's environment, at its epsilon of evaluations."""
         self.judged += 1
         env = config.env if self.judged == self.turns else replace(config.env, max_steps=self.cut)
-        evaluator = build_evaluator(env, replace(config.evaluation, num_envs=self.episodes))
+        evaluator = build_evaluator(env, replace(config.evaluation, num_envs=self.episodes), here().cores)
         return evaluator(EpsilonGreedy(q_values, _ACTIONS), self.episodes, _QUIET).summary.mean
 
 
@@ -73,7 +75,8 @@ def ours(judge: Judge) -> Iterator[Measure[Turn]]:
     quiet = ("evaluation.at_end=false", "evaluation.every_steps=null", "evaluation.video=false")
     config = composed("experiment=fast", *GAME, *quiet)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        trainer = build_trainer(config, Path(folder), NullJournal(), _QUIET)
+        set_up_torch(config, config.device)
+        trainer = build_trainer(config, here().cores, Path(folder), Tracker(), _QUIET)
         stack.callback(trainer.emulators.close)
 
         def measure(seconds: float) -> Turn:

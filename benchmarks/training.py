@@ -22,7 +22,9 @@ from rich.console import Console
 
 from atlantis_exp.build import build_trainer
 from atlantis_exp.config import Config
+from atlantis_exp.machine import here
 from atlantis_exp.runs.journal import Journal, Tracker
+from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Trainer
 from benchmarks.composition import composed
@@ -78,7 +80,10 @@ def training_config(batch_size: int, every: int, *overrides: str) -> Config:
 def learning(config: Config, tracker_of: Callable[[Path], Tracker] = Journal) -> Iterator[Trainer]:
     """A trainer in a temporary folder that has begun to learn."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        trainer = build_trainer(config, Path(folder), tracker_of(Path(folder)), Progress(Console(quiet=True)))
+        set_up_torch(config, config.device)
+        trainer = build_trainer(
+            config, here().cores, Path(folder), tracker_of(Path(folder)), Progress(Console(quiet=True))
+        )
         stack.callback(trainer.emulators.close)
         trainer.run(lambda: trainer.learner.updates >= _WARM_UPDATES)
         yield trainer

@@ -43,7 +43,7 @@ def main() -> None:
     command = (sys.executable, "-m", "atlantis_exp", "ui", f"port={port}", f"paths.outputs={outputs}")
     server = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
     store, root = Store(outputs), f"http://127.0.0.1:{port}"
-    kinds = {run.tags["atlantis.kind"]: run.run_id for run in store.runs()}
+    kinds = {run.data.tags["atlantis.kind"]: run.info.run_id for run in store.runs()}
     places = {view: address(root, store.experiment_id, view) for view in (START, SWEEP, COMPARISONS)}
     runs = places[START].partition("?")[0]
     try:

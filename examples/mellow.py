@@ -2,21 +2,19 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
 
 import torch
-from annotated_types import Interval
 
-from atlantis_exp.components import component
+from atlantis_exp.components import Positive, component
 from atlantis_exp.learning.objectives import DQN, QFunction, bootstrapped
 
 
 @component("mellow", "objective")
 @dataclass(frozen=True)
-class Mellow(DQN):
+class MellowObjective(DQN):
     """DQN with mellowmax in the place of the maximum (Asadi and Littman 2017)."""
 
-    omega: Annotated[float, Interval(gt=0)] = 5.0
+    omega: Positive = 5.0
 
     def targets(
         self, r_t: torch.Tensor, s_tpm: torch.Tensor, discount: torch.Tensor, online: QFunction, target: QFunction

@@ -23,7 +23,7 @@ class Block(nn.Module):
 
 
 @component("residual", "model")
-class Residual(nn.Module):
+class ResidualNetwork(nn.Module):
     smallest_side = 8  # pixels
     splits_batches = True  # no batch statistics, no dropout
 

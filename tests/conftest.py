@@ -31,6 +31,7 @@ from atlantis_exp.components import facts_of
 from atlantis_exp.config import Config
 from atlantis_exp.runs.folder import Result, RunFolder, evaluation_at
 from atlantis_exp.runs.journal import Journal
+from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.tracking.store import Store
 from atlantis_exp.training.evaluation import Episode, Evaluation
 from atlantis_exp.training.progress import Progress
@@ -228,7 +229,8 @@ def started() -> Iterator[Callable[[Config, Path], Trainer]]:
     trainers = []
 
     def trainer_of(config: Config, folder: Path) -> Trainer:
-        trainer = build_trainer(config, folder, Journal(folder), Progress(Console(quiet=True)))
+        set_up_torch(config, config.device)
+        trainer = build_trainer(config, 1, folder, Journal(folder), Progress(Console(quiet=True)))
         trainers.append(trainer)
         if (state := trainer.checkpoints.load(trainer.memory)) is not None:
             trainer.load_state_dict(state)

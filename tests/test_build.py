@@ -15,6 +15,7 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.game.vector import ProcessEmulators
 from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.sessions.processor import set_up_torch
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -70,7 +71,7 @@ def test_a_gpu_is_asked_for_bits_that_repeat_and_for_all_of_float32(
     """What comes of it, only a GPU shows: tests/learning/test_on_a_gpu.py."""
     monkeypatch.setattr(torch.backends.cudnn, "deterministic", False)
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
-    build_learner(tiny())
+    set_up_torch(tiny(), "cpu")
     assert (torch.backends.cudnn.deterministic, torch.backends.cudnn.allow_tf32) == (True, False)
 
 
@@ -118,9 +119,7 @@ def test_emulators_share_the_cores_where_the_system_does_not_say_which_are_ours(
     """As on macOS."""
     monkeypatch.delattr(os, "sched_getaffinity")
     monkeypatch.delattr(os, "sched_setaffinity")
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    with build_emulators(tiny("env.num_envs=3", "env.workers=null").env, 3) as emulators:
+    with build_emulators(tiny("env.num_envs=3", "env.workers=null").env, 2, 3) as emulators:
         assert isinstance(emulators, ProcessEmulators)
         assert len(emulators._processes) == 2
         emulators.reset(range(3), [0, 1, 2])
@@ -130,10 +129,9 @@ def test_emulators_share_the_cores_where_the_system_does_not_say_which_are_ours(
     ("asked", "cores", "workers"), [("null", 128, 4), ("null", 4, 3), ("null", 2, 1), ("null", 1, 1), ("2", 2, 2)]
 )
 def test_an_evaluation_leaves_a_core_to_the_network(
-    tiny: Callable[..., Config], monkeypatch: pytest.MonkeyPatch, asked: str, cores: int, workers: int
+    tiny: Callable[..., Config], asked: str, cores: int, workers: int
 ) -> None:
-    monkeypatch.setattr("atlantis_exp.build._cores", lambda: cores)
     config = tiny("evaluation.num_envs=4", f"env.workers={asked}")
-    with build_evaluator(config.env, config.evaluation).make_emulators(4) as emulators:
+    with build_evaluator(config.env, config.evaluation, cores).make_emulators(4) as emulators:
         assert isinstance(emulators, ProcessEmulators)
         assert len(emulators._processes) == workers

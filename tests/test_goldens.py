@@ -33,6 +33,7 @@ from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.config import Config
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.sessions.job import replaced
+from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.training.fingerprint import history
 
 Command = Callable[..., int]
@@ -197,6 +198,7 @@ def test_twelve_updates_on_the_same_transitions_make_the_same_weights(line: str)
     config, memory = composed(*SMALL, *line.split()), filled_memory()
     for name in SAMPLERS:
         phase = replace(config.phase["quick"], sampler=name)
+        set_up_torch(config, config.device)
         plan, learner = build_plan(replace(config, phase={"quick": phase})), build_learner(config)
         sampler, rng = plan.phases[0].sampler, np.random.default_rng(11)
         batches = hashlib.sha256()

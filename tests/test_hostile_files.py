@@ -5,28 +5,37 @@ import io
 import json
 import logging
 import os
+import random
 import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from atlantis_exp import commands
+from atlantis_exp.build import build_memory
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.overrides import check
+from atlantis_exp.config import Config, PathsConfig
 from atlantis_exp.faults import Fault
-from atlantis_exp.sessions.job import replaced
+from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.launchers import BASIC
-from atlantis_exp.training.checkpoint import _checksum
-
-pytestmark = pytest.mark.slow
+from atlantis_exp.sessions.training import train
+from atlantis_exp.sessions.weights import stored_weights
+from atlantis_exp.training.checkpoint import Checkpoints, _checksum
+from benchmarks.composition import composed
 
 PLAYING = ("episodes=1", "evaluation.video=false", "device=cpu")
 VERBS = {
@@ -182,6 +191,7 @@ def damaged(path: Path, how: str) -> None:
             path.write_bytes(how.encode() + b"\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pattern", "verb", "how"),
     [(pattern, verb, how) for pattern, verbs in READ_BY.items() for verb in verbs for how in WAYS],
@@ -215,13 +225,10 @@ def prepared(name: str, *words: str) -> Callable[[], object]:
     verb: Verb[Any] = importlib.import_module(f"atlantis_exp.commands.{name}").VERB
     jobs = check(verb.config_name or name, verb.schema, verb.rewrite(list(words)))
     asked = [Asked(config, name, overrides, typed=words) for overrides, config in jobs.items()]
-    works = [verb.work(each) for each in asked]
-
-    def work() -> None:
-        with verb.sweep(asked, BASIC, words) if len(asked) > 1 else nullcontext():
-            for each in works:
-                each()
-
+    if len(asked) > 1 and verb.sweep is not None:
+        sweep = verb.sweep
+        return lambda: sweep(asked, BASIC, words)
+    work: Callable[[], object] = verb.work(asked[0])
     return work
 
 
@@ -355,6 +362,7 @@ def fuzzed(sound: tuple[Path, tuple[str, ...]], tmp_path_factory: pytest.TempPat
 FUZZED = sorted((pattern, verb) for pattern, verbs in READ_BY.items() for verb in verbs)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(7_200)
 def test_a_changed_file_is_one_line(fuzzed: Callable[..., None], sound: tuple[Path, tuple[str, ...]]) -> None:
     @settings(
@@ -371,3 +379,144 @@ def test_a_changed_file_is_one_line(fuzzed: Callable[..., None], sound: tuple[Pa
         fuzzed(pattern, verb, data.draw(change(path)), data.draw(st.booleans()))
 
     changed()
+
+
+# Forged: checkpoints whose checksums are all true, and whose contents are not what a training leaves.
+
+State = dict[str, Any]
+Forged = Callable[[Callable[[State, ReplayMemory], object]], Config]
+
+
+def damage_frames(memory: ReplayMemory) -> None:
+    frames = memory._frames
+    for start, stop in frames._spans(np.arange(memory.oldest_id, memory.next_id)).tolist():
+        frames._buffer[start:stop] = b"\xff" * (stop - start)
+
+
+def of_the_optimizer(state: State, name: str) -> torch.Tensor:
+    tensor: torch.Tensor = state["learner"]["optimizer"]["0"][name]
+    return tensor
+
+
+FORGERIES: dict[str, Callable[[State, ReplayMemory], object]] = {
+    "actions that the game lacks": lambda _, memory: memory._action.fill(255),
+    "observations that do not unpack": lambda _, memory: damage_frames(memory),
+    "steps without an end": lambda state, _: state["counters"].update(steps=2**62),
+    "steps of another type": lambda state, _: state["counters"].update(steps=[80]),
+    "updates that are due for years": lambda state, _: state["counters"].update(learn_ticks=0, steps=2**50),
+    "time without an end": lambda state, _: state["counters"].update(seconds=float("inf")),
+    "updates beyond an int64": lambda state, _: state["learner"].update(updates=2**63 - 1),
+    "an optimizer before its start": lambda state, _: of_the_optimizer(state, "step").fill_(-5),
+    "an optimizer of another name": lambda state, _: state["learner"]["optimizer"]["0"].update(
+        exp_avgs=state["learner"]["optimizer"]["0"].pop("exp_avg")
+    ),
+    "moments of another size": lambda state, _: state["learner"]["optimizer"]["0"].update(
+        exp_avg=of_the_optimizer(state, "exp_avg")[1:]
+    ),
+    "priorities that are not numbers": lambda state, _: state["samplers"]["0"]["priorities"].fill(np.nan),
+    "priorities of another memory": lambda state, _: state["samplers"]["0"].update(priorities=np.ones(7)),
+    "priorities of what is to come": lambda state, _: state["samplers"]["0"].update(next_id=2**40),
+    "priorities from before the beginning": lambda state, _: state["samplers"]["0"].update(oldest_id=-(2**63)),
+    "a highest priority of nothing": lambda state, _: state["samplers"]["0"].update(highest=0.0),
+    "a stack of another size": lambda state, _: state["stack"].update(state=state["stack"]["state"][..., 1:]),
+    "a stack of another type": lambda state, _: state["stack"].update(state=state["stack"]["state"].astype(float)),
+    "a score that is not a number": lambda state, _: state["scores"].fill(np.nan),
+    "scores that are not numbers": lambda state, _: state["episodes"].fill(np.nan),
+    "lengths of other episodes": lambda state, _: state.update(lengths=np.zeros(7, np.int64)),
+    "half an evaluation": lambda state, _: state.update(last_metrics={"evaluation/mean": 1.0}),
+    "a best mean in words": lambda state, _: state.update(best_mean="good"),
+    "an emulator's action that the game lacks": lambda state, _: state["emulators"]["0"]["actions"].fill(99),
+    "an emulator of nothing": lambda state, _: state["emulators"]["0"].update(ale=np.zeros(0, np.uint8)),
+}
+
+
+@pytest.fixture(scope="module")
+def halfway(tmp_path_factory: pytest.TempPathFactory, tiny_overrides: tuple[str, ...]) -> tuple[Path, Config]:
+    """A training that a larger budget continues, and the config that does."""
+    outputs = tmp_path_factory.mktemp("halfway")
+    words = replaced(tiny_overrides, "sampler=prioritized", f"paths.outputs={outputs}")
+    train(Job(composed(*words, "budget.steps=70")))
+    return outputs, composed(*words)
+
+
+@pytest.fixture
+def forged(halfway: tuple[Path, Config], tmp_path: Path) -> Forged:
+    """Forges the checkpoint of a copy of it, and returns the config that continues this."""
+    shutil.copytree(halfway[0], tmp_path / "outputs")
+    config = replace(halfway[1], paths=PathsConfig(outputs=str(tmp_path / "outputs")))
+
+    def forge(change: Callable[[State, ReplayMemory], object]) -> Config:
+        memory, checkpoints = build_memory(config), Checkpoints(RunFolder.of(config).checkpoints, config.identity())
+        state = checkpoints.load(memory)
+        assert state is not None
+        change(state, memory)
+        checkpoints._segments = []  # written anew, and true to their checksums
+        checkpoints.save(state, memory)
+        return config
+
+    return forge
+
+
+@pytest.mark.parametrize("change", FORGERIES.values(), ids=FORGERIES)
+def test_a_forged_checkpoint_is_one_line(change: Callable[[State, ReplayMemory], object], forged: Forged) -> None:
+    config = forged(change)
+    with soon(), pytest.raises(Fault) as refused:
+        train(Job(config))
+    assert "\n" not in str(refused.value)
+    assert "resume=never" in str(refused.value) or "none of this training" in str(refused.value)
+
+
+def test_what_training_refuses_as_forged_is_not_played_either(forged: Forged) -> None:
+    config = forged(FORGERIES["steps without an end"])
+    with pytest.raises(Fault, match="none of this training"):
+        stored_weights(RunFolder.of(config), "latest")
+
+
+def test_what_is_not_changed_goes_on(forged: Forged) -> None:
+    train(Job(config := forged(lambda *_: None)))
+    assert RunFolder.of(config).state == "done"
+
+
+def anywhere(seed: int) -> Callable[[State, ReplayMemory], None]:
+    """A forgery of any leaf of a state: a number or a text of a form that hurts, an array cut, retyped or filled."""
+
+    def change(state: State, _: ReplayMemory) -> None:
+        rng = random.Random(seed)
+        leaves: list[tuple[Any, Any]] = []
+
+        def walk(node: State) -> None:
+            for key, value in node.items():
+                if isinstance(value, dict) and value:
+                    walk(value)
+                else:
+                    leaves.append((node, key))
+
+        walk(state)
+        node, key = rng.choice(leaves)
+        if not isinstance(value := node[key], np.ndarray | torch.Tensor):
+            node[key] = rng.choice((*NUMBERS, *TEXTS, None, [], {}, True))
+            return
+        array = np.asarray(value).copy()
+        match rng.choice(("cut", "retype", "fill")):
+            case "cut":
+                array = array.reshape(-1)[1:]
+            case "retype":
+                array = array.astype(rng.choice((np.float32, np.int64, np.uint8, np.bool_)))
+            case _ if array.dtype.kind == "f":
+                array.fill(rng.choice((np.nan, np.inf, -1e30, 1e30, 0)))
+            case _:
+                array.fill(rng.choice((0, 1, 255 if array.dtype == np.uint8 else 2**40)))
+        node[key] = torch.from_numpy(array) if isinstance(value, torch.Tensor) else array
+
+    return change
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(200))
+def test_a_checkpoint_forged_anywhere_goes_on_or_is_one_line(
+    seed: int, forged: Forged, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = forged(anywhere(seed))
+    with soon(), suppress(Fault):
+        train(Job(config))
+    assert "Warning" not in capsys.readouterr().err

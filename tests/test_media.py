@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from atlantis_exp import media
-from atlantis_exp.media import BLUE, ORANGE, curves, film, run_colour, scene, score_heatmap, score_histogram, strips
+from atlantis_exp.media import BLUE, ORANGE, film, run_colour, scene, score_heatmap, score_histogram
 
 AXIS = (1e3, 1e6)
 
@@ -93,13 +92,6 @@ def test_colours_are_those_of_the_network_paler_where_another_sampler_is_used() 
     assert run_colour("another") == run_colour("another", "uniform")
 
 
-def test_figures_of_a_sweep_show_every_group_in_its_colour_even_one_without_points() -> None:
-    picture = pixels(curves({"a": (BLUE, [[(0, 1.0), (9, 2.0)], [(0, 3.0)]]), "b": (ORANGE, [[]])}, "x", "y"))
-    assert coloured(picture, BLUE).any()
-    picture = pixels(strips({"a": (BLUE, [1.0, 2.0]), "b": (ORANGE, [3.0])}, "x"))
-    assert coloured(picture, ORANGE).any()
-
-
 def top_level_boxes(mp4: bytes) -> list[str]:
     boxes, at = [], 0
     while at < len(mp4):
@@ -130,11 +122,3 @@ def test_a_film_holds_every_screen_as_h264_that_browsers_play(mp4: bytes) -> Non
 def test_a_films_index_comes_before_its_pictures_so_that_a_browser_starts_at_once(mp4: bytes) -> None:
     boxes = top_level_boxes(mp4)
     assert boxes.index("moov") < boxes.index("mdat")
-
-
-def test_a_groups_mean_goes_as_far_as_all_its_runs_whatever_their_steps() -> None:
-    runs = [np.array([[0.0, 10.0, 30.0], [0.0, 10.0, 30.0]]), np.array([[5.0, 21.0], [15.0, 31.0]])]
-    steps, means = media._mean_curve(runs)
-    assert (steps[0], steps[-1]) == (5, 21)
-    np.testing.assert_allclose(means, steps + 5)
-    assert media._mean_curve([runs[0], np.empty((2, 0))])[0].size == 0

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import MISSING
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ import safetensors.numpy
 
 from atlantis_exp.checking import parse, to_dict
 from atlantis_exp.commands.overrides import check, located
-from atlantis_exp.components import Plugin, admit, admitted
+from atlantis_exp.components import KINDS, admit, admitted, built_in, read
 from atlantis_exp.config import Config
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.sessions.job import replaced
@@ -136,7 +137,9 @@ def packaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     about = tmp_path / "site" / "atlantis_mynet-0.3.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: atlantis-mynet\nVersion: 0.3\n")
-    (about / "entry_points.txt").write_text("[atlantis_exp.plugins]\nnets = mypackage.nets\n")
+    (about / "entry_points.txt").write_text("[atlantis_exp.plugins]\nmynet = mypackage.nets\n")
+    for module in ("mypackage", "mypackage.nets"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
     monkeypatch.setenv("MYPACKAGE", "not imported")
     monkeypatch.chdir(tmp_path)
@@ -161,13 +164,6 @@ def said(command: Command, capsys: pytest.CaptureFixture[str]) -> Said:
 def _nothing_is_admitted_afterwards() -> Iterator[None]:
     yield
     admit([])
-
-
-def admitted_plugin(reference: str) -> Plugin:
-    admit([reference])
-    (plugin,) = {each.plugin for each in admitted().values()}
-    assert plugin is not None
-    return plugin
 
 
 def test_all_kinds_from_files_are_trained_and_continued_bit_for_bit(
@@ -210,7 +206,6 @@ def test_all_kinds_from_files_are_killed_and_continued_bit_for_bit(
 def test_a_sweep_side_by_side_finds_plugins_and_options_of_one_s_own(
     plugins: Path, tiny_overrides: tuple[str, ...]
 ) -> None:
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     (plugins / "own" / "model").mkdir(parents=True)
     (plugins / "own" / "model" / "wide.yaml").write_text("defaults: [mynet]\nwidth: 32\n")
     words = replaced(tiny_overrides, "phase.quick.steps=20", "evaluation.at_end=false", "paths.outputs=outputs")
@@ -292,33 +287,126 @@ def test_a_run_is_evaluated_exported_played_and_compared(
 def test_a_package_is_listed_and_named_without_being_imported(
     said: Said, command: Command, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    sha = admitted_plugin("atlantis-mynet").sha256[:12]
-    line = said("model=mynet")
-    assert line == f"atlantis_exp: model=mynet: add plugins=atlantis-mynet (atlantis-mynet 0.3, sha {sha})"
+    assert said("model=mynet") == "atlantis_exp: model=mynet: add plugins=atlantis-mynet"
     assert "'atlantis-mynet'" in said("plugins=atlantis-mynt")
-    assert "width=0: should be greater than or equal to 1" in said(
-        "model=mynet", "plugins=atlantis-mynet", "model.width=0"
-    )
     capsys.readouterr()
     assert command("--help") == 0
-    assert f"plugins=atlantis-mynet (atlantis-mynet 0.3, sha {sha}): model=mynet" in capsys.readouterr().out
-    assert command("model=mynet", "plugins=atlantis-mynet", "--cfg", "job") == 0
-    assert "width: 12\n" in capsys.readouterr().out
+    assert "plugins=atlantis-mynet: mynet\n" in capsys.readouterr().out
     assert os.environ["MYPACKAGE"] == "not imported"
 
 
-def test_a_package_is_imported_when_it_is_built(
+@pytest.mark.usefixtures("packaged")
+def test_a_package_that_is_named_gives_settings_ranges_and_values(
+    said: Said, command: Command, capsys: pytest.CaptureFixture[str]
+) -> None:
+    named = ("model=mynet", "plugins=atlantis-mynet")
+    assert "width=0: should be greater than or equal to 1" in said(*named, "model.width=0")
+    assert command(*named, "--cfg", "job") == 0
+    assert "width: 12\n" in capsys.readouterr().out
+    assert os.environ["MYPACKAGE"] == "imported"
+
+
+def test_a_package_is_trained_and_its_identity_is_that_of_all_its_sources(
     packaged: Path, command: Command, tiny_overrides: tuple[str, ...]
 ) -> None:
     words = replaced(tiny_overrides, "phase.quick.steps=20", "evaluation.at_end=false")
     assert command(*words, "model=mynet", "plugins=atlantis-mynet", f"paths.outputs={packaged.parent}") == 0
-    assert os.environ["MYPACKAGE"] == "imported"
     ((_, before),) = check("config", Config, ["model=mynet", "plugins=atlantis-mynet"]).items()
     assert before.plugins["atlantis-mynet"].version == "0.3"
     (packaged / "other.py").write_text("x = 1\n")
     admit([])
     ((_, after),) = check("config", Config, ["model=mynet", "plugins=atlantis-mynet"]).items()
     assert before.identity() != after.identity()
+
+
+INHERITED = """
+from dataclasses import dataclass
+from typing import Annotated
+
+from annotated_types import Interval
+
+from atlantis_exp.components import component
+from atlantis_exp.learning.objectives import Quantile
+from atlantis_exp.networks.resnet_fast import ResNetFast
+
+WIDEST = 512
+
+
+@component("mynet", "model")
+class MyNet(ResNetFast):
+    pass
+
+
+@component("wider", "model")
+class Wider(ResNetFast):
+    def __init__(self, input_shape, num_actions, head, *, width: Annotated[int, Interval(ge=1, le=WIDEST)] = 8):
+        super().__init__(input_shape, num_actions, head)
+
+
+@component("myquantile", "objective")
+class MyQuantile(Quantile):
+    pass
+
+
+@component("mean", "objective")
+@dataclass(frozen=True)
+class Mean(Quantile):
+    power: "float" = 2.0
+"""
+
+
+@pytest.fixture
+def inherited(tmp_path: Path) -> dict[str, Any]:
+    """Components that inherit from ours, by name."""
+    (tmp_path / "inherited.py").write_text(INHERITED)
+    admit([str(tmp_path / "inherited.py")])
+    return {name: each for (_, name), each in admitted().items()}
+
+
+def test_a_class_inherits_facts(inherited: dict[str, Any]) -> None:
+    assert inherited["mynet"].facts == {"input_size": 84, "smallest_side": 8, "splits_batches": True}
+    assert [inherited[name].facts["head"] for name in ("myquantile", "mean")] == ["quantile", "quantile"]
+
+
+def test_a_class_inherits_settings(inherited: dict[str, Any]) -> None:
+    assert [each.name for each in inherited["myquantile"].settings] == ["quantiles"]
+    assert {each.name: each.default for each in inherited["mean"].settings} == {"quantiles": MISSING, "power": 2.0}
+
+
+@pytest.mark.usefixtures("inherited")
+def test_a_bound_may_be_a_constant(said: Said, tmp_path: Path) -> None:
+    plugin = f"plugins={tmp_path / 'inherited.py'}"
+    assert "model.width=513: should be less than or equal to 512" in said("model=wider", plugin, "model.width=513")
+
+
+@pytest.mark.parametrize(("kind", "name"), built_in())
+def test_our_classes_are_declared_as_they_are(kind: str, name: str) -> None:
+    component = built_in()[kind, name]
+    settings, facts = read(kind, component.load())
+    assert {each.name: each.type for each in component.settings} == {each.name: each.type for each in settings}
+    assert component.facts == facts
+    assert component.path.is_file()
+
+
+CONTRACTS = [  # kind, a method of one of the parts, what is there instead
+    ("sampler", "sample(self, memory, batch_size, rng)", "sample(self, memory, batch_size)"),
+    ("sampler", "feed_back(self, ids, errors)", "feedback(self, ids, errors)"),
+    ("sampler", "state_dict(self)", "state(self)"),
+    ("sampler", "load_state_dict(self, state)", "load_state_dict(self)"),
+    ("objective", "targets(self, r_t, s_tpm, discount, online, target)", "targets(self, r_t, s_tpm)"),
+    ("epsilon", "__call__(self, progress, steps)", "__call__(self, progress)"),
+    ("epsilon", "__call__(self, progress, steps)", "call(self, progress, steps)"),
+]
+
+
+@pytest.mark.parametrize(("kind", "method", "instead"), CONTRACTS)
+def test_a_method_that_does_not_take_what_it_is_given_is_one_line(
+    kind: str, method: str, instead: str, plugins: Path, said: Said
+) -> None:
+    assert f"def {method}:" in OTHERS
+    (plugins / "parts.py").write_text(OTHERS.replace(f"def {method}:", f"def {instead}:"))
+    assert kind in KINDS
+    assert re.search(rf"/parts\.py:\d+: TypeError: needs a method {re.escape(method)}$", said("plugins=./parts.py"))
 
 
 BROKEN = [  # what is in mynet.py instead of a part of it, the line that is to blame, and what is said of it
@@ -330,48 +418,37 @@ BROKEN = [  # what is in mynet.py instead of a part of it, the line that is to b
     (
         "self.head((x",
         "((x",
-        "class MyNet",
+        "@component",
         r"TypeError: MyNet returns \(2, 200\) for two states; it should be \(2, 4\)",
     ),
-    ("num_actions, head, *,", "*,", "def __init__", r"__init__ takes 1 arguments; it is given 3"),
+    ("num_actions, head, *,", "*,", "@component", r"TypeError: __init__ takes 1 arguments; it is given 3"),
     (
         "width: Width",
-        "width: np.ndarray",
-        "def __init__",
-        r"width: np.ndarray is no type of a setting; write int, float",
+        "width: torch.Tensor",
+        "@component",
+        r"TypeError: width: .*Tensor is not a type of a setting; use",
     ),
+    ("width: Width", "width: np.ndarray", "def __init__", r"NameError: name 'np' is not defined"),
+    ("width: Width", "width: 'a side of'", "@component", r"SyntaxError: "),
+    ("width: Width", "width: Annotated[int]", "def __init__", r"TypeError: Annotated"),
+    ("width: Width", "settings: Width", "@component", r"TypeError: settings: a setting has .* not one of component,"),
+    ("width: Width = 8", "width=8", "@component", r"TypeError: width: has no type"),
+    ("width: Width = 8", "width: Width = 80", "@component", r"TypeError: width: default 80: Input should be less than"),
+    ("width: Width = 8", "width: Width = torch.ones(1)", "@component", r"TypeError: Object of type Tensor is not JSON"),
+    ("Interval(ge=1, le=64)", "Interval(1, 64)", "Width =", r"TypeError: Interval.__init__\(\) takes 1 positional"),
+    ("Interval(ge=1, le=64)", "Interval(ge='x')", "@component", r"\w+Error: "),
     (
-        "width: Width",
-        "width: 'a side of'",
-        "def __init__",
-        r"width: 'a side of' is no type of a setting",
+        '"mynet", "model"',
+        '"mynet", "modle"',
+        "@component",
+        r"ValueError: 'modle': no such kind; did you mean 'model'\?",
     ),
-    ("width: Width", "width: Annotated[int]", "def __init__", r"width: Annotated\[int\] is no type of a setting"),
-    (
-        "Width = Annotated[int, Interval(ge=1, le=64)]",
-        "Width = Width",
-        "\n",
-        r"a class or a type in it is made of itself",
-    ),
-    (
-        '@component("mynet", "model")\nclass MyNet(nn.Module)',
-        'class Other(MyNet): ...\n@component("mynet", "model")\nclass MyNet(Other)',
-        "\n",
-        r"a class or a type in it is made of itself",
-    ),
-    ("width: Width", "settings: Width", "def __init__", r"settings: a setting is of small .* and not 'component' or"),
-    ("width: Width = 8", "width=8", "def __init__", r"width: has no type"),
-    ("width: Width = 8", "width: Width = 4 + 4", "def __init__", r"width: its value should be a number"),
-    (
-        "Interval(ge=1, le=64)",
-        "Interval(1, 64)",
-        "Width =",
-        r"width: Interval\(1, 64\) is no range; write Interval\(ge=1",
-    ),
-    ('"mynet", "model"', '"mynet", "modle"', "@component", r"'modle': no such kind; did you mean 'model'\?"),
-    ('"mynet", "model"', '"MyNet", "model"', "@component", r"'MyNet': a name is of small letters"),
-    ('"mynet", "model"', '"cnn", "model"', "class MyNet", r"model=cnn is built in and is not replaced"),
-    ("smallest_side = 8", "smallest_side = 8.5", "smallest_side", r"smallest_side: should be as in smallest_side = 1"),
+    ('"mynet", "model"', '"mynet"', "@component", r"ValueError: '': no such kind"),
+    ('"mynet", "model"', '"MyNet", "model"', "@component", r"ValueError: 'MyNet': a name has lowercase letters"),
+    ('"mynet", "model"', '"cnn", "model"', "@component", r"model=cnn is built in and is not replaced"),
+    ("smallest_side = 8", "smallest_side = 8.5", "@component", r"TypeError: smallest_side: should be a int, not 8\.5"),
+    ("def forward(self, x)", "def forward(self)", "@component", r"TypeError: needs a method forward\(self, x\)"),
+    ("import torch\n", "import torch\nraise SystemExit(3)\n", "raise System", r"SystemExit: 3"),
     ('@component("mynet", "model")\n', "", "", r"names no component; put @component"),
 ]
 
@@ -393,11 +470,11 @@ def test_a_plugin_that_fails_is_one_line_with_its_file_and_line(
 
 def test_a_head_of_quantiles_needs_their_number(plugins: Path, said: Said) -> None:
     (plugins / "parts.py").write_text(OTHERS.replace("    caution:", "    head = 'quantile'\n    caution:"))
-    assert re.search(r"/parts.py:\d+: head = .* needs a setting quantiles", said("plugins=./parts.py"))
+    assert re.search(r"/parts.py:\d+: TypeError: head = .* needs a setting quantiles", said("plugins=./parts.py"))
     (plugins / "parts.py").write_text(
         OTHERS.replace("    caution:", "    head = 'quantile'\n    quantiles: str = 'x'\n    caution:")
     )
-    assert re.search(r"/parts.py:\d+: head = .* needs a setting quantiles: int", said("plugins=./parts.py"))
+    assert re.search(r"/parts.py:\d+: TypeError: head = .* needs a setting quantiles: int", said("plugins=./parts.py"))
 
 
 @pytest.mark.parametrize(
@@ -405,7 +482,7 @@ def test_a_head_of_quantiles_needs_their_number(plugins: Path, said: Said) -> No
     [
         ("plugins=./none.py", "there is no file /.*/none.py"),
         ("plugins=./other/mynet.py,mynet.py", r"mynet\.py: /.*/other/mynet\.py is called mynet, too; rename one"),
-        ("plugins=copy.py,mynet.py", r"/mynet.py:14: model=mynet is /.*/copy\.py's, too"),
+        ("plugins=copy.py,mynet.py", r"/mynet.py:13: model=mynet is /.*/copy\.py's, too"),
         ("plugins=./my-net.py", r"write a file NAME\.py"),
         ("plugins=nothing", "no such distribution is installed"),
         ("plugins=3", "write files and distributions"),
@@ -438,18 +515,23 @@ def test_options_of_one_s_own_come_from_a_folder_and_name_no_code(
     assert "'mine'" in said("--config-dir=own", "experiment=mne")
     experiment = (own / "experiment" / "mine.yaml").read_text()
     for text, reason in {
-        "hydra: {callbacks: {x: {_target_: os.system}}}": r"sets hydra\.callbacks, which may name code",
-        "hydra: {launcher: {_target_: os.system}}": r"sets hydra\.launcher",
-        "hydra: {overrides: {task: ['plugins=[mynet.py]']}}": r"sets hydra\.overrides",
-        "hydra: {overrides: {task: null}}": r"hydra\.overrides\.task|sets hydra\.overrides",
-        "hydra: {job: {env_set: {PYTHONPATH: own}}}": r"sets hydra\.job",
-        "hydra: {job: {chdir: true}}": r"sets hydra\.job",
-        "hydra: {job: {env_copy: [PATH]}}": r"sets hydra\.job",
         "plugins: [./mynet.py]": "names plugins; only the command line may",
         "optimizer: {_target_: os.system}": r"optimizer\._target_: no such key",
     }.items():
         (own / "experiment" / "mine.yaml").write_text(experiment.replace("optimizer: {lr: 0.5}", text))
         assert re.search(reason, said("--config-dir=own", "experiment=mine"))
+    marker = plugins / "was_run"
+    for text in (  # nothing of Hydra's is made or run, whatever a file says of it
+        f"hydra: {{callbacks: {{x: {{_target_: pathlib.Path.touch, self: {marker}}}}}}}",
+        "hydra: {overrides: {task: ['plugins=[mynet.py]']}}",
+        "hydra: {job: {chdir: true, env_set: {PYTHONPATH: own}}}",
+    ):
+        (own / "experiment" / "mine.yaml").write_text(f"{experiment}{text}\n")
+        assert command("--config-dir=own", "experiment=mine", "--cfg", "job") == 0
+        assert re.search(r"lr: 0\.5\n", capsys.readouterr().out)
+    assert not marker.exists()
+    assert Path.cwd() == plugins
+    assert os.environ.get("PYTHONPATH") != "own"
     (own / "model" / "cnn.yaml").write_text("name: cnn\n")
     assert "/own/model/cnn.yaml: model=cnn is ours and is not replaced" in said("--config-dir=own", "seed=1")
     (own / "model" / "cnn.yaml").unlink()
@@ -459,7 +541,8 @@ def test_options_of_one_s_own_come_from_a_folder_and_name_no_code(
 
 def test_an_installed_plugin_that_cannot_be_read_is_not_called_missing(packaged: Path, said: Said) -> None:
     (packaged / "nets.py").unlink()
-    assert re.search(r"names mypackage\.nets, which is not there", said("plugins=atlantis-mynet", "--cfg", "job"))
+    reason = r"plugins=atlantis-mynet: ModuleNotFoundError: No module named 'mypackage\.nets'"
+    assert re.search(reason, said("plugins=atlantis-mynet", "--cfg", "job"))
 
 
 @pytest.mark.parametrize(

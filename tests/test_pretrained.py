@@ -46,7 +46,7 @@ def test_a_folder_plays_alike_on_any_number_of_cores(folder: Path, monkeypatch: 
     states = np.random.default_rng(0).integers(0, 256, (40, env.stack, env.size, env.size), np.uint8)
     values = []
     for cores in (1, 3):
-        monkeypatch.setattr(build, "_THREADS", cores)
+        monkeypatch.setattr(build, "OWN_THREADS", cores)
         actor = build_exported_actor(card.config, weights, "cpu")
         assert isinstance(actor, EpsilonGreedy)
         values.append(actor.q_values(states))

@@ -2,6 +2,7 @@
 
 import statistics
 import sys
+import tracemalloc
 from importlib.util import find_spec
 from random import Random
 from types import ModuleType
@@ -124,7 +125,7 @@ def test_intervals_are_rliables_to_the_digit_when_the_same_samples_are_drawn(lib
 
 def test_a_resample_draws_whole_seeds_and_then_their_episodes() -> None:
     seeds = [np.arange(10.0), np.arange(100.0, 110.0), np.arange(200.0, 210.0)]
-    samples = resample(seeds, 400, np.random.default_rng(0))
+    samples = [*resample(seeds, 400, np.random.default_rng(0))]
     for sample in samples:
         assert sample.size == 30
         parts = sample.reshape(3, 10)
@@ -133,6 +134,15 @@ def test_a_resample_draws_whole_seeds_and_then_their_episodes() -> None:
     hundreds = [tuple(sorted(sample.reshape(3, 10)[:, 0] // 100)) for sample in samples]
     assert 0.15 < np.mean([len(set(drawn)) == 3 for drawn in hundreds]) < 0.3  # 3! / 3^3 = 0.222
     assert all(len(set(sample.reshape(3, 10)[0])) < 10 for sample in samples[:20])  # episodes come again too
+
+
+def test_a_bootstrap_of_many_episodes_takes_the_memory_of_one_sample() -> None:
+    tracemalloc.start()
+    means = [sample.mean() for sample in resample([np.ones(20_000)], 100, np.random.default_rng(0))]
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert means == [1.0] * 100
+    assert peak < 10 * 20_000 * 8
 
 
 def test_with_one_seed_a_resample_is_rliables_of_its_episodes(library: Any) -> None:

@@ -8,24 +8,27 @@ import importlib
 import sys
 from pathlib import Path
 
+from atlantis_exp import interrupts
+
 VERBS = {
-    "train": "one run, from a composed config; the same command again continues or reports it (the default verb)",
-    "search": "the best values of any keys, by Optuna: trials=20 optimizer=adam,rmsprop",
-    "evaluate": "a stored run's network, played again: run=NAME epsilon=0.05; an exported one: weights=FOLDER",
-    "export": "a stored run's network as a folder to hand on: weights, card and scores: run=NAME to=pretrained/NAME",
-    "baseline": "a player without a network as a tracked run: agent=random, agent=constant",
-    "play": "a person at the keyboard as a tracked run: player=NAME",
-    "decide": "the question itself: trains the seeds that it needs, stops when it is answered: model=cnn,resnet_fast",
-    "compare": "finished runs as groups: intervals, a verdict, a page of figures: by=model,sampler",
-    "query": "what the environment is, and what this config makes of it",
-    "check": "do components keep what the rest relies on, and what do they cost: model=mynet plugins=./mynet.py",
-    "new": "a package with a component of your own, to begin with: model=mynet to=FOLDER",
-    "verify-resume": "proves, for any training, that killing and continuing it changes no bit",
-    "report": "the results that the outputs folder holds, as a table",
-    "sync": "run folders into an MLflow store; to=URI to a server, from=URI from one, every=30s until interrupted",
-    "ui": "the MLflow UI on the local store",
+    "train": "train one network; the same command again continues or reports it",
+    "decide": "train the seeds that a question needs until it is answered: model=cnn,resnet_fast",
+    "compare": "compare finished runs as groups: intervals, a verdict, a page of figures: by=model,sampler",
+    "evaluate": "play a stored run's network again: run=NAME epsilon=0.05; an exported one: weights=FOLDER",
+    "report": "print the results in the outputs folder as a table",
+    "ui": "serve the MLflow UI on the local store",
+    "search": "find the best values of any keys, by Optuna: trials=20 optimizer=adam,rmsprop",
+    "export": "write a stored run's network as a folder to hand on: weights, card, scores: run=NAME to=pretrained/NAME",
+    "baseline": "play without a network, as a tracked run: agent=random, agent=constant",
+    "play": "play yourself at the keyboard, as a tracked run: player=NAME",
+    "query": "describe the environment, and what this config makes of it",
+    "check": "try a component's contracts and measure its cost: model=mynet plugins=./mynet.py",
+    "new": "write a package with a component of your own to begin with: model=mynet to=FOLDER",
+    "verify-resume": "prove for any training that killing and continuing it changes no bit",
+    "sync": "publish run folders to an MLflow store; to=URI to a server, every=30s until interrupted",
 }
-"""Each verb and what it does, as `--help` lists them."""
+"""Each verb and what it does, as `--help` lists them: those of every day first."""
+DAILY = 6
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 CHECKOUT = _PACKAGE.parent
@@ -35,6 +38,23 @@ CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else CHECKOUT / "conf"
 
 def main() -> None:
     """Run the verb that the command line names first; only its own module is imported."""
+    interrupts.listen()
+    try:
+        verb, arguments = _asked()
+        importlib.import_module(f"atlantis_exp.commands.{verb.replace('-', '_')}").VERB.run(arguments)
+    except Exception:
+        if not interrupts.seen():
+            raise
+    except KeyboardInterrupt:  # before there is anything to lose, or a verb would have said so
+        pass
+    else:
+        return
+    print("atlantis_exp: interrupted", file=sys.stderr)
+    sys.exit(130)  # 128 + SIGINT
+
+
+def _asked() -> tuple[str, list[str]]:
+    """Return the verb and its arguments; print help or the version instead, where that is asked for."""
     first, *rest = sys.argv[1:] or [""]
     if first in VERBS:
         verb, arguments = first, rest
@@ -47,17 +67,14 @@ def main() -> None:
         verb, arguments = "train", sys.argv[1:]
     if {"--help", "-h"} & {*arguments}:
         from atlantis_exp import terminal
-        from atlantis_exp.commands.helping import help_text
+        from atlantis_exp.commands.helping import help_text, overview
 
-        terminal.console().print(help_text(verb, arguments))  # which a reader that has had enough does not hurt
+        text = help_text(verb, arguments) if first in VERBS or len(arguments) > 1 else overview()
+        terminal.console().print(text)  # survives a closed pipe
         sys.exit(0)
     if "--version" in arguments:
         from importlib.metadata import version
 
         print(f"atlantis-exp {version('atlantis-exp')}")
         sys.exit(0)
-    try:
-        importlib.import_module(f"atlantis_exp.commands.{verb.replace('-', '_')}").VERB.run(arguments)
-    except KeyboardInterrupt:  # before there is anything to lose, or a verb would have said so
-        print("atlantis_exp: interrupted", file=sys.stderr)
-        sys.exit(130)  # 128 + SIGINT
+    return verb, arguments

@@ -1,24 +1,17 @@
-"""A verb as a Hydra app: overrides checked before anything is written, then Hydra's own main with all its flags."""
+"""A verb: its arguments checked before anything is written, then the one call that does the work."""
 
-import os
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
-from typing import Generic, NoReturn, TypeVar
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
-from omegaconf import DictConfig
-
-from atlantis_exp import terminal
-from atlantis_exp.commands import CONF
-from atlantis_exp.commands.composing import admit, checked
-from atlantis_exp.commands.overrides import check, is_run, launcher, located, refuse_twice
-from atlantis_exp.faults import Fault
+from atlantis_exp import interrupts, terminal
+from atlantis_exp.commands.composing import admit
+from atlantis_exp.commands.overrides import check, flags_of, launcher, located, refuse_twice, shown
+from atlantis_exp.faults import ConfigError, Fault, remedied
+from atlantis_exp.machine import Machine, here
 from atlantis_exp.sessions.job import command_line
-from atlantis_exp.sessions.launchers import Launcher, job_apart
+from atlantis_exp.sessions.launchers import Launcher
 
 T = TypeVar("T")
 
@@ -30,8 +23,8 @@ class Asked(Generic[T]):
     config: T
     verb: str
     overrides: tuple[str, ...]  # of this job alone, where it is one of a sweep
-    launcher: str | None = None  # of the sweep that this process does one job of, but for Hydra's own
-    typed: tuple[str, ...] = ()  # all arguments, before they became overrides; empty in a launcher's worker
+    typed: tuple[str, ...] = ()  # all arguments, before they became overrides
+    machine: Machine = field(default_factory=here)
 
     @property
     def command(self) -> str:
@@ -50,76 +43,61 @@ class Verb(Generic[T]):
     config_name: str = ""  # of the file under conf/; that of the verb unless it says otherwise
     rewrite: Callable[[list[str]], list[str]] = list
     """From arguments as people write them to Hydra's overrides. Raises: ConfigError."""
-    sweep: Callable[[Sequence[Asked[T]], Launcher, Sequence[str]], AbstractContextManager[None]] = lambda *_: (
-        nullcontext()
-    )
-    """From all jobs of a sweep, its launcher and the arguments to the context that the sweep runs in."""
+    sweep: Callable[[Sequence[Asked[T]], Launcher, Sequence[str]], None] | None = None
+    """Does the jobs of a sweep by a launcher, given the arguments; None: one after the other."""
 
     def run(self, arguments: list[str]) -> None:
-        """Compose the config with the arguments, check it, and do the work.
+        """Check the config that the arguments make, and do the work.
 
-        A user's mistake ends the process with exit code 2 and one line on stderr before Hydra or the work starts; a
-        `Fault` ends it with its own exit code and one line, and so does a folder that cannot be written.
+        A user's mistake ends the process with exit code 2 and one line on stderr before the work starts; a `Fault` ends
+        it with its own exit code and one line, and so does a folder that cannot be written.
         """
-        config_name = self.config_name or self.name
         try:
-            admit([])  # an earlier command of this process may have named plugins
-            arguments = located(arguments)
-            typed = tuple(arguments)
-            refuse_twice(arguments := self.rewrite(arguments))
-            jobs = check(config_name, self.schema, arguments)
-            chosen = launcher(config_name, arguments)
-            flags = tuple(text for text in arguments if text.startswith("--config-dir="))
-            if is_run(arguments):  # which Hydra itself would compose twice more
-                ((overrides, config),) = jobs.items()
+            typed = located(arguments)
+            arguments = self.rewrite(list(typed))
+            asked = self.asked(arguments, typed)
+            flags = flags_of(arguments)
+            if flags.cfg:
+                print(shown(self.config_name or self.name, arguments), end="")
+            elif not flags.multirun:
                 with terminal.working(f"{self.name}: loading"):
-                    call = self.work(Asked(config, self.name, (*flags, *overrides), job_apart(), typed))
+                    call = self.work(asked[0])
+                if interrupts.seen():
+                    raise KeyboardInterrupt
                 call()
-                return
+            elif self.sweep is not None:
+                self.sweep(asked, launcher(arguments), arguments)
+            elif not launcher(arguments).is_basic:
+                raise ConfigError(f"hydra/launcher: runs trainings; {self.name} does one after the other, leave it out")
+            else:
+                in_turn(self.work, asked)
         except (Fault, OSError) as error:
-            exit_with(error)
+            terminal.warn(remedied(error))
+            sys.exit(getattr(error, "exit_code", 1))
 
-        @hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)
-        def task(composed: DictConfig) -> None:
-            overrides = (*flags, *HydraConfig.get().overrides.task)
-            try:
-                config = checked(self.schema, composed)
-                late = self.work(Asked(config, self.name, overrides, _job_launcher(), typed))()
-            except (Fault, OSError) as error:
-                # In a sweep an exit would take the other jobs along, an exception does not.
-                if _is_sweep():
-                    raise
-                exit_with(error)
-            if isinstance(late, int) and _is_sweep():  # it came when this job had nothing left to stop
-                sys.exit(128 + late)
+    def asked(self, arguments: Sequence[str], typed: Sequence[str] = ()) -> list[Asked[T]]:
+        """Check every job that arguments ask for. Raises: ConfigError."""
+        admit([])  # an earlier command of this process may have named plugins
+        refuse_twice(arguments)
+        own = flags_of(arguments).config_dir
+        flags = (f"--config-dir={own}",) if own else ()
+        jobs = check(self.config_name or self.name, self.schema, arguments)
+        return [Asked(config, self.name, (*flags, *texts), tuple(typed)) for texts, config in jobs.items()]
 
-        sys.argv[1:] = arguments  # which Hydra reads
-        os.environ.setdefault("HYDRA_FULL_ERROR", "1")
-        asked = [Asked(config, self.name, (*flags, *overrides)) for overrides, config in jobs.items()]
-        is_one = len(asked) == 1 and chosen.is_basic
+
+def in_turn(work: Callable[[Asked[T]], Callable[[], object]], asked: Sequence[Asked[T]]) -> None:
+    """Do the jobs of a sweep one after the other; if one fails the others are done, then the first error is raised.
+
+    A signal that came when a job had nothing left to stop ends the process after it.
+    """
+    first: Exception | None = None
+    for each in asked:
         try:
-            with nullcontext() if is_one else self.sweep(asked, chosen, arguments):
-                task()
-        except (Fault, OSError) as error:
-            exit_with(error)
-
-
-def exit_with(error: Exception) -> NoReturn:
-    """End the process with one line and the error's exit code: 2 for a user's mistake."""
-    terminal.warn(str(error))
-    sys.exit(getattr(error, "exit_code", 1))
-
-
-def _is_sweep() -> bool:
-    """Whether Hydra runs this job as one of several."""
-    return HydraConfig.get().mode is RunMode.MULTIRUN
-
-
-def _job_launcher() -> str | None:
-    """The launcher that this process does one job of a sweep for; None where that is Hydra's own, or there is none."""
-    if (apart := job_apart()) is not None:
-        return apart
-    if not _is_sweep():
-        return None
-    name = str(HydraConfig.get().runtime.choices["hydra/launcher"])
-    return None if Launcher(name).is_basic else name
+            late = work(each)()
+        except Exception as error:
+            first = first or error
+        else:
+            if isinstance(late, int):
+                sys.exit(128 + late)
+    if first is not None:
+        raise first

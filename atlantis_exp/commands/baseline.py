@@ -60,7 +60,14 @@ def _work(asked: Asked[BaselineConfig]) -> Callable[[], None]:
     from atlantis_exp.sessions.evaluating import play_baseline
 
     config = asked.config
-    return partial(play_baseline, **vars(config), name=config.run_name(), title=config.title(), command=asked.command)
+    return partial(
+        play_baseline,
+        **vars(config),
+        name=config.run_name(),
+        title=config.title(),
+        command=asked.command,
+        cores=asked.machine.cores,
+    )
 
 
 VERB = Verb("baseline", BaselineConfig, _work)

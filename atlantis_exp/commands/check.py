@@ -1,4 +1,4 @@
-"""`python -m atlantis_exp check model=mynet plugins=./mynet.py`: does a component keep what the rest relies on?"""
+"""`python -m atlantis_exp check model=mynet plugins=./mynet.py`: does a component keep its contracts?"""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -6,6 +6,7 @@ from functools import partial
 
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.jobs import job_of, training_of
+from atlantis_exp.components import KINDS
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import replaced
@@ -16,20 +17,26 @@ _SMALL = (  # a training of seconds
     *("training.precision=fp32", "threads=1", "evaluation.at_end=false", "evaluation.every_episodes=null"),
     *("evaluation.every_steps=null", "tracking=none", "tracking.commit_episodes=2"),
 )
+_OURS = ("model=cnn", "model=resnet", "sampler=uniform", "objective=dqn")
+"""The components that others of their kinds are measured beside."""
 
 
 def _work(asked: Asked[Config]) -> Callable[[], None]:
-    from atlantis_exp.sessions.contracts import check
+    from atlantis_exp.sessions.contracts import check, trials
 
-    chosen = [text for text in asked.overrides if not text.startswith("phase")]
-    references = [f"model={name}" for name in ("cnn", "resnet")]
-    own = [text for text in asked.overrides if not text.startswith("model")]
-    others = []
-    for text in references:
-        if text not in asked.overrides:
-            with suppress(ConfigError):  # these settings may be none for a network that nobody asked about
-                others.append(training_of([*own, text]))
-    return partial(check, job_of(asked), training_of(replaced(chosen, *_SMALL)), others)
+    job = job_of(asked)
+    chosen = [text for text in asked.overrides if text.partition("=")[0] in KINDS]
+    kinds = [text.partition("=")[0] for text in chosen] or [*KINDS]
+    measured = {}
+    if references := [text for text in _OURS if text.partition("=")[0] in kinds]:
+        measured["\n".join(chosen) or f"model={job.config.model.name}"] = job
+        for text in references:
+            kind = text.partition("=")[0]
+            own = [each for each in asked.overrides if not each.startswith(kind)]
+            with suppress(ConfigError):  # other settings may not go with it
+                measured.setdefault(text, training_of([*own, text]))
+    small = training_of(replaced([text for text in asked.overrides if not text.startswith("phase")], *_SMALL))
+    return partial(check, trials(job.config, small, kinds), measured)
 
 
 VERB = Verb("check", Config, _work)

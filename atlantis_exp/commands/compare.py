@@ -10,7 +10,8 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
-from atlantis_exp.config import STRICT, PathsConfig, Probability, TrackingConfig
+from atlantis_exp.components import Probability
+from atlantis_exp.config import STRICT, PathsConfig, TrackingConfig
 from atlantis_exp.faults import ConfigError
 
 if TYPE_CHECKING:
@@ -28,9 +29,8 @@ class CompareConfig:
     baseline: str | None  # a value of one of the keys of by, or a group; null: all pairs
     delta: str | float | None  # a difference that does not matter: 5% of a score, or points
     seeds: Annotated[int, Field(ge=5, le=10_000)]  # a group, at the last look
-    error: Annotated[float, Field(gt=0, lt=1)]  # probability of any false verdict
+    error: Annotated[float, Field(ge=1e-6, lt=1)]  # probability of any false verdict
     look: Literal["due", "now"]
-    why: bool  # also ask the networks themselves
     tracking: TrackingConfig
     paths: PathsConfig
 
@@ -60,10 +60,10 @@ def margin(delta: str | float | None) -> tuple[float | None, bool]:
     return value, text.endswith("%")
 
 
-def _list_out(arguments: list[str]) -> list[str]:
+def list_out(arguments: list[str]) -> list[str]:
     """Let a list be written without brackets, as in `by=model,sampler`."""
     # Hydra itself would take the commas for a sweep, and a second `=` for a mistake.
-    return [re.sub(r"^(by|runs|where)=([^\[].*)$", _listed, argument) for argument in as_texts(arguments)]
+    return [re.sub(r"^(by|runs|where)=([^\[].*)$", listed, argument) for argument in as_texts(arguments)]
 
 
 def as_texts(arguments: Iterable[str]) -> list[str]:
@@ -71,31 +71,18 @@ def as_texts(arguments: Iterable[str]) -> list[str]:
     return [re.sub(r"^baseline=(?!null$)([^'\"]+)$", r"baseline='\1'", argument) for argument in arguments]
 
 
-def _listed(match: re.Match[str]) -> str:
+def listed(match: re.Match[str]) -> str:
+    """Return KEY=a,b of a match as KEY=['a','b']."""
     items = (f"'{item}'" for item in re.split(r",(?![^\[]*\])", match[2].replace("'", "")))
     return f"{match[1]}=[{','.join(items)}]"
 
 
 def _work(asked: Asked[CompareConfig]) -> Callable[[], object]:
-    from atlantis_exp.comparison.comparing import compare
+    from atlantis_exp.sessions.comparing import Choice, compare
 
-    config, probe = asked.config, None
-    if config.why:
-        from atlantis_exp.sessions.probing import probe_groups
-
-        probe = partial(probe_groups, Path(config.paths.outputs))
-    return partial(
-        compare,
-        config.question,
-        runs=config.runs,
-        where=config.where,
-        at_epsilon=config.at_epsilon,
-        look_now=config.look == "now",
-        tracking=config.tracking,
-        paths=config.paths,
-        command=asked.command,
-        probe=probe,
-    )
+    config = asked.config
+    choice = Choice(Path(config.paths.outputs), config.runs, config.where, config.at_epsilon)
+    return partial(compare, config.question, choice, config.tracking, asked.command, look_now=config.look == "now")
 
 
-VERB = Verb("compare", CompareConfig, _work, rewrite=_list_out)
+VERB = Verb("compare", CompareConfig, _work, rewrite=list_out)

@@ -1,8 +1,7 @@
-"""The config groups composed into a checked config; Hydra's compose API and OmegaConf are here and in `app` alone."""
+"""The config groups composed into a checked config; by Hydra's compose API."""
 
 import hashlib
 import re
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
@@ -10,11 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from hydra import initialize_config_dir
-from hydra._internal.hydra import Hydra
-from hydra._internal.utils import create_config_search_path
-from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.config_store import ConfigStore
-from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
@@ -37,11 +32,7 @@ def _outputs_folder() -> str:
     return str((CHECKOUT if CONF.parent == CHECKOUT else Path.cwd()) / "outputs")
 
 
-# Our presets reuse the plugins' names so that the plugins validate the keys; Hydra warns.
-warnings.filterwarnings("ignore", message=r"\n'hydra/launcher/\w+' is validated against ConfigStore schema")
 OmegaConf.register_new_resolver("outputs_folder", _outputs_folder, replace=True)
-# Of a Ray cluster that is started here, bytes, the least that Ray takes; a running cluster (a string) has its own.
-OmegaConf.register_new_resolver("ray_object_store", lambda address: None if address else 78_643_200, replace=True)
 
 
 def _head_for(objective: str, other: str = "plain") -> str:
@@ -98,7 +89,7 @@ def admit(plugins: Any) -> None:
     for component in components.admitted().values():
         if (CONF / component.kind / f"{component.name}.yaml").is_file():
             raise ConfigError(
-                f"{component.source.path}:{component.line}: {component.kind}={component.name} is one of our presets "
+                f"{component.path}:{component.line}: {component.kind}={component.name} is one of our presets "
                 "and is not replaced; give yours another name"
             )
         ConfigStore.instance().store(name=component.name, group=component.kind, node=_option(component))
@@ -112,7 +103,7 @@ def _option(component: components.Component) -> dict[str, Any]:
     if component.kind == "model":
         node["input_size"] = component.facts["input_size"]
     node |= {each.name: "???" if each.default is MISSING else each.default for each in component.settings}
-    path = component.source.path.parent / "conf" / component.kind / f"{component.name}.yaml"
+    path = component.path.parent / "conf" / component.kind / f"{component.name}.yaml"
     if path.is_file():
         try:
             values = OmegaConf.to_container(OmegaConf.load(path))
@@ -127,20 +118,7 @@ def _option(component: components.Component) -> dict[str, Any]:
 
 
 @contextmanager
-def composing(own: Path | None = None) -> Iterator[None]:
-    """Let `compose` compose from the config groups, inside of one of Hydra's jobs too.
-
-    own: a folder with further options, as Hydra's `--config-dir` takes it.
-    """
-    under_way = GlobalHydra.instance().hydra  # of the job that asks; there can be only one at a time
-    GlobalHydra.instance().clear()
-    try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            if own is not None:  # as `hydra.main` takes it: behind ours, ahead of plugins' options
-                path = create_config_search_path(str(CONF))
-                path.prepend("command-line", f"file://{own}", SearchPathQuery(provider="schema"))
-                GlobalHydra.instance().clear()
-                Hydra.create_main_hydra2("app", path)
-            yield
-    finally:
-        GlobalHydra.instance().hydra = under_way
+def composing() -> Iterator[None]:
+    """Let Hydra compose from the config groups."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        yield

@@ -1,6 +1,7 @@
 """`python -m atlantis_exp decide model=cnn,resnet_fast`: trains the seeds that the question needs, and answers it."""
 
 import dataclasses
+import re
 from collections.abc import Callable, Iterable
 from functools import cache, partial
 from typing import TYPE_CHECKING, Annotated
@@ -10,7 +11,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
-from atlantis_exp.commands.compare import as_texts, margin
+from atlantis_exp.commands.compare import as_texts, listed, margin
 from atlantis_exp.commands.jobs import training_of
 from atlantis_exp.commands.overrides import (
     check,
@@ -21,23 +22,25 @@ from atlantis_exp.commands.overrides import (
     refuse_twice,
     swept,
     values_of,
+    with_first_values,
 )
 from atlantis_exp.config import FREE, STRICT, Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import command_line
 
 if TYPE_CHECKING:
-    from atlantis_exp.sessions.deciding import Request
+    from atlantis_exp.sessions.deciding import Contest
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class DecideConfig(Config):
     """A question about contenders, each a training of this config but for the keys that tell them apart."""
 
+    against: list[str]  # overrides: with all of them, or with none
     baseline: str | None
     delta: str | Annotated[float, Field(gt=0)] | Annotated[int, Field(gt=0)] | None
     seeds: Annotated[int, Field(ge=5, le=1_000)]
-    error: Annotated[float, Field(gt=0, lt=1)]
+    error: Annotated[float, Field(ge=1e-6, lt=1)]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -50,14 +53,19 @@ _OWN = {field.name for field in dataclasses.fields(DecideConfig)} - {field.name 
 _CLOSED = _OWN | FREE | {"seed", "evaluation"}
 
 
+def _as_texts(arguments: Iterable[str]) -> list[str]:
+    """Return arguments with `against` as a list, which may be written without brackets."""
+    return [re.sub(r"^(against)=([^\[].*)$", listed, argument) for argument in as_texts(arguments)]
+
+
 def _launchers(texts: Iterable[str]) -> list[str]:
     """The overrides that choose a launcher and set it up."""
     return [text for text in texts if key_of(text).startswith(("hydra/launcher", "hydra.launcher."))]
 
 
 def _first_contender(arguments: list[str]) -> list[str]:
-    """Leave out the keys that tell contenders apart, and the launcher: what they share is composed, and run here."""
-    texts, is_sweep = read_flags(arguments := as_texts(arguments))
+    """Take the first contender without the launcher: its config, which the others share, is composed and run here."""
+    texts, is_sweep = read_flags(arguments := _as_texts(arguments))
     if is_sweep:
         raise ConfigError("-m: decide plans its own sweeps; drop -m")
     refuse_twice(arguments)
@@ -67,26 +75,27 @@ def _first_contender(arguments: list[str]) -> list[str]:
             raise ConfigError(f"{text}: decide trains seeds from 0 on, as many as it needs; drop it")
         if override.key_or_group == "resume" and override.value() != "auto":
             raise ConfigError(f"{text}: decide goes on with the runs that are there; drop it")
-    dropped = (*swept(arguments), *_launchers(texts))
-    return [argument for argument in arguments if argument not in dropped]
+    dropped = _launchers(texts)
+    return with_first_values([argument for argument in arguments if argument not in dropped])
 
 
 def _work(asked: Asked[DecideConfig]) -> Callable[[], None]:
     from atlantis_exp.sessions.deciding import decide
 
-    return partial(decide, request_of(asked))
+    return partial(decide, contest_of(asked))
 
 
-def request_of(asked: Asked[DecideConfig]) -> "Request":
-    """The question that was asked. Raises: ConfigError for one that cannot be decided."""
+def contest_of(asked: Asked[DecideConfig]) -> "Contest":
+    """Return the question that was asked. Raises: ConfigError for one that cannot be decided."""
     from atlantis_exp.comparison.verdict import Question
-    from atlantis_exp.sessions.deciding import Request
+    from atlantis_exp.sessions.deciding import Contest
 
-    config, typed = asked.config, as_texts(asked.typed)
+    config, typed = asked.config, _as_texts(asked.typed)
     several = swept(typed)
-    choices = []
-    for text in several:
-        override = read_override(text)
+    if several and config.against:
+        raise ConfigError(f"{several[0]}: several values, and against= as well; write one of the two")
+    overrides = [read_override(text) for text in several or config.against]
+    for override in overrides:
         key = override.key_or_group
         if key.split(".")[0] in _CLOSED:
             raise ConfigError(f"{key}: says how contenders are trained or measured, not what they are; one value only")
@@ -94,10 +103,14 @@ def request_of(asked: Asked[DecideConfig]) -> "Request":
             raise ConfigError(
                 "experiment: a preset is no single key; name those that differ, as in objective=dqn,quantile"
             )
-        if not override.is_discrete_sweep() or isinstance(override.value(), Glob):
-            raise ConfigError(f"{text}: no list of values; write them out, as in model=cnn,resnet_fast")
-        choices.append([f"{text.split('=', 1)[0]}={value}" for value in values_of(override)])
-    contenders = list(combined(choices))
+        if several and (not override.is_discrete_sweep() or isinstance(override.value(), Glob)):
+            raise ConfigError(f"{override.input_line}: no list of values; write them out, as in model=cnn,resnet_fast")
+    contenders = [(), tuple(config.against)]
+    if not config.against:
+        choices = [
+            [f"{str(each.input_line).split('=', 1)[0]}={value}" for value in values_of(each)] for each in overrides
+        ]
+        contenders = list(combined(choices))
     if len(contenders) < 2:
         raise ConfigError("nothing to decide between: give a key several values, as in model=cnn,resnet_fast")
     texts = read_flags(typed)[0]  # as typed: Hydra has put values in the place of ${...}
@@ -108,10 +121,10 @@ def request_of(asked: Asked[DecideConfig]) -> "Request":
     launcher = [*flags, *launchers]
     check("config", Config, ["-m", *launcher, *several, *fixed])
     delta, relative = margin(config.delta)
-    keys = tuple(read_override(text).key_or_group for text in several)
-    return Request(
-        question=Question(keys, config.seeds, config.error, delta, relative, config.baseline),
-        contenders=contenders,
+    keys = tuple(override.key_or_group for override in overrides)
+    return Contest(
+        Question(keys, config.seeds, config.error, delta, relative, config.baseline),
+        contenders,
         several=several,
         fixed=fixed,
         launcher=launcher,

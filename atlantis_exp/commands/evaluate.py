@@ -43,7 +43,7 @@ def _work(asked: Asked[EvaluateConfig]) -> Callable[[], None]:
     from atlantis_exp.sessions.evaluating import evaluate
 
     keys = {override.split("=")[0].lstrip("+") for override in asked.overrides}
-    return partial(evaluate, **vars(asked.config), asked=keys, command=asked.command)
+    return partial(evaluate, **vars(asked.config), asked=keys, command=asked.command, cores=asked.machine.cores)
 
 
 VERB = Verb("evaluate", EvaluateConfig, _work, rewrite=spell_out)

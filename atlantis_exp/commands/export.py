@@ -28,7 +28,7 @@ class ExportConfig:
 def _work(asked: Asked[ExportConfig]) -> Callable[[], None]:
     from atlantis_exp.sessions.exporting import export
 
-    return partial(export, **vars(asked.config))
+    return partial(export, **vars(asked.config), cores=asked.machine.cores)
 
 
 VERB = Verb("export", ExportConfig, _work, rewrite=spell_out)

@@ -1,15 +1,16 @@
-"""`--help` of a verb: its keys and groups with the sentences that stand next to them in conf/; loads nothing heavy."""
+"""`--help`: the verbs, and the keys of one with the sentences beside them in conf/; loads nothing heavy."""
 
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
-from atlantis_exp.commands import CONF, VERBS
+from atlantis_exp.commands import CONF, DAILY, VERBS
 from atlantis_exp.terminal import PROGRAM
 
 _GROUP = re.compile(r" +- (?P<preset>override /)?(?P<group>[\w@.]+): (?P<option>\w+)\s*(?:#.*)?")
 _KEY = re.compile(r"(?P<indent> *)(?P<key>\w+):(?P<value>.*?)\s*(?:#(?P<comment>.*))?")
 _SHOWN = re.compile(r"  ([\w.]+)(?:=|\s|$)")  # a key as a help shows it
+_DAILY = ("model", "sampler", "env", "objective", "phase")  # groups that a help shows first
 _VALUES = 30  # columns of a key and its value, behind which its sentence begins
 
 _SWEEP = """\
@@ -18,34 +19,41 @@ _SWEEP = """\
 _FLAGS = """\
   --cfg job          print the config instead; --resolve fills in what refers to other keys
   --config-dir DIR   further options of groups, in files of your own
-  --version          of atlantis-exp
-  --help"""
+  --help             with GROUP=OPTION also the option's keys, with `all` every key"""
+
+
+def overview() -> str:
+    """Return the first screen: the verbs, those of every day first."""
+    lines = [f"  {name:15}{purpose}" for name, purpose in VERBS.items()]
+    lines.insert(DAILY, "\nmore:")
+    parts = [f"{PROGRAM} [VERB] KEY=VALUE ...", "\n".join(lines), *_plugins()]
+    return "\n\n".join([*parts, "No verb means train. VERB --help lists its keys."])
 
 
 def help_text(verb: str, arguments: Sequence[str]) -> str:
-    """What a verb does, and every key it takes; of a group those of the option that the arguments choose."""
-    chosen = dict(text.split("=", 1) for text in arguments if "=" in text)
-    preset = CONF / "experiment" / f"{chosen.get('experiment')}.yaml"
-    if preset.is_file():
-        chosen = dict(_groups(preset)) | chosen
+    """Return what a verb does, its keys and groups, and the keys of the options that the arguments name."""
+    named = dict(text.split("=", 1) for text in arguments if "=" in text)
+    preset = CONF / "experiment" / f"{named.get('experiment')}.yaml"
+    chosen = dict(_groups(preset)) | named if preset.is_file() else named
     path = CONF / f"{'config' if verb == 'train' else verb}.yaml"
-    groups = dict(_groups(path))
-    parts = [f"{PROGRAM} {verb} KEY=VALUE ...\n{VERBS[verb]}"]
-    if keys := [*_keys(path, "")]:
-        parts.append("\n".join(["== Keys ==", *keys]))
-    if groups:
-        parts.append("== Groups, chosen by GROUP=OPTION, and the keys of the option that is chosen ==")
+    keys = [*_keys(path, "")]
     own = {match[1] for line in keys if (match := _SHOWN.match(line))}
-    for group, option in groups.items():
-        parts.append("\n".join(_without(own, _of_group(group, chosen.get(group, option)))))
-    if plugins := _plugins():
-        parts.append("\n".join(["== Plugins ==", *plugins]))
-    parts.append(f"== Flags ==\n{'' if verb in ('decide', 'search') else _SWEEP}{_FLAGS}")
-    parts.append("\n".join(["== Verbs ==", *(f"  {name:15}{purpose}" for name, purpose in VERBS.items())]))
-    return "\n\n".join(parts)
+    short, full = [], []
+    groups = dict(_groups(path))
+    for group, option in sorted(groups.items(), key=lambda item: (*_DAILY, item[0]).index(item[0])):
+        line, *others = _of_group(group, chosen.get(group, option))
+        if group in named or "all" in arguments:
+            full.append("\n".join([line, *_without(own, others)]))
+        elif "@" not in group:
+            short.append(f"  {line}")
+    parts = [f"{PROGRAM} {verb} KEY=VALUE ...\n{VERBS[verb]}"]
+    parts += ["\n".join([title, *lines]) for title, lines in (("Keys:", keys), ("Groups:", short)) if lines]
+    parts += full
+    return "\n\n".join([*parts, *_plugins(), f"Flags:\n{'' if verb in ('decide', 'search') else _SWEEP}{_FLAGS}"])
 
 
 def _of_group(name: str, option: str) -> Iterator[str]:
+    """Yield a group with its options, then the keys of one of them."""
     folder, _, package = name.partition("@")
     options = sorted(path.stem for path in (CONF / folder).glob("*.yaml"))
     yield f"{name}={option}   ({', '.join(options)})"
@@ -55,7 +63,7 @@ def _of_group(name: str, option: str) -> Iterator[str]:
 
 
 def _without(taken: Collection[str], lines: Iterable[str]) -> Iterator[str]:
-    """The lines of a group but for keys that the verb's own file sets, with their sentences."""
+    """Yield the lines of a group but for keys that the verb's own file sets, with their sentences."""
     is_taken = False
     for line in lines:
         if match := _SHOWN.match(line):
@@ -65,25 +73,32 @@ def _without(taken: Collection[str], lines: Iterable[str]) -> Iterator[str]:
 
 
 def _groups(path: Path) -> Iterator[tuple[str, str]]:
-    """The groups of a file's defaults list and their options, those of the files that it names included."""
+    """Yield the groups of a file's defaults list with their options, those of the files that it names too."""
     for line in _defaults(path):
         if match := _GROUP.fullmatch(line):
             yield match["group"], match["option"]
-        elif (other := path.parent / f"{line.strip(' -')}.yaml").is_file() and other.stem != "hydra_defaults":
+        elif (other := path.parent / f"{line.strip(' -')}.yaml").is_file():
             yield from _groups(other)
 
 
 def _defaults(path: Path) -> list[str]:
-    """The lines of a file's defaults list."""
+    """Return the lines of a file's defaults list."""
     match = re.search(r"^defaults:\n((?: +.*\n)+)", path.read_text("utf-8"), re.MULTILINE)
     return match[1].splitlines() if match else []
 
 
 def _keys(path: Path, prefix: str) -> Iterator[str]:
-    """A line a key of a file, those of the files that it is made of first: dotted key, value, sentence."""
+    """Yield a line for each key of a file: dotted key, value, sentence; those of the files that it is made of first."""
+    own = [*_own_keys(path, prefix)]
+    names = {match[1] for line in own if (match := _SHOWN.match(line))}
     for line in _defaults(path):
-        if (base := path.parent / f"{line.strip(' -')}.yaml").is_file() and base.stem != "hydra_defaults":
-            yield from _keys(base, prefix)
+        if (base := path.parent / f"{line.strip(' -')}.yaml").is_file():
+            yield from _without(names, _keys(base, prefix))
+    yield from own
+
+
+def _own_keys(path: Path, prefix: str) -> Iterator[str]:
+    """Yield a line for each key that stands in a file itself, as `_keys`."""
     parents: list[str] = []
     in_defaults = False
     for line in path.read_text("utf-8").splitlines():
@@ -100,12 +115,9 @@ def _keys(path: Path, prefix: str) -> Iterator[str]:
             yield f"  {shown:{_VALUES - 1}}  {comment}".rstrip()
 
 
-def _plugins() -> list[str]:
-    """Components of installed distributions, none of which is imported for it."""
+def _plugins() -> Iterator[str]:
+    """Yield a paragraph of the installed distributions with components, none of them imported."""
     from atlantis_exp.components import installed
 
-    return [
-        f"  plugins={name} ({parts[0].plugin}): {', '.join(f'{part.kind}={part.name}' for part in parts)}"
-        for name, parts in installed().items()
-        if parts
-    ]
+    if lines := [f"  plugins={name}: {', '.join(names)}" for name, names in installed().items()]:
+        yield "\n".join(["Plugins:", *lines])

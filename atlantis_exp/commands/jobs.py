@@ -16,7 +16,7 @@ _SPELLED = 4  # values at most; beyond them a few digits of their hash tell runs
 
 def job_of(asked: Asked[Config]) -> Job:
     """The training that was asked for."""
-    return Job(asked.config, words_of(asked.overrides), asked.overrides, asked.launcher)
+    return Job(asked.config, words_of(asked.overrides), asked.overrides, asked.machine)
 
 
 def words_of(overrides: Sequence[str]) -> tuple[str, ...]:

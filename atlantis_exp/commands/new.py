@@ -10,54 +10,49 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from atlantis_exp.checking import absolute
+from atlantis_exp.commands import CONF
 from atlantis_exp.commands.app import Asked, Verb
-from atlantis_exp.components import KINDS, NAME, built_in
+from atlantis_exp.components import NAME, built_in
 from atlantis_exp.config import STRICT
 from atlantis_exp.faults import ConfigError
-
-_KINDS = tuple(kind for kind in KINDS if kind != "env")  # a game is facts, which no template has
+from atlantis_exp.sessions.new import EXAMPLES, begin
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class NewConfig:
-    """A component's kind and name, and where its package is to be."""
+    """A component's kind and name, and the folder of its package."""
 
     component: dict[str, str | None]  # by kind
     to: Annotated[str, Field(min_length=1)] | None
 
     def __post_init__(self) -> None:
-        for kind, name in self.named.items():
+        for kind, name in self.component.items():
+            if name is None:
+                continue
             if not re.fullmatch(NAME, name):
                 raise ConfigError(
-                    f"{kind}={name}: a name is of small letters, digits and underscores, as in {kind}=mynet"
+                    f"{kind}={name}: a name has lowercase letters, digits and underscores, as in {kind}=mynet"
                 )
-            if keyword.iskeyword(name) or keyword.iskeyword(name.capitalize()):
+            if keyword.iskeyword(name):
                 raise ConfigError(f"{kind}={name}: is a word of Python's own; give yours another name")
             if (kind, name) in built_in():
                 raise ConfigError(f"{kind}={name}: is built in and is not replaced; give yours another name")
-
-    @property
-    def named(self) -> dict[str, str]:
-        """The names by kind."""
-        return {kind: name for kind, name in self.component.items() if name is not None}
 
 
 def _spell_out(arguments: list[str]) -> list[str]:
     """Let `model=` on the command line be the component's."""
     # Hydra itself would take `model` for the config group of that name.
-    return [re.sub(rf"^({'|'.join(_KINDS)})=", r"component.\1=", argument) for argument in arguments]
+    return [re.sub(rf"^({'|'.join(EXAMPLES)})=", r"component.\1=", argument) for argument in arguments]
 
 
 def _work(asked: Asked[NewConfig]) -> Callable[[], None]:
-    from atlantis_exp.sessions.beginning import begin
-
-    config = asked.config
-    if len(config.named) != 1:
-        raise ConfigError(f"new: name one component, as one of {', '.join(_KINDS)}: model=mynet")
-    ((kind, name),) = config.named.items()
-    if config.to is None:
+    named = [(kind, name) for kind, name in asked.config.component.items() if name is not None]
+    if len(named) != 1:
+        raise ConfigError(f"new: name one component, as one of {', '.join(EXAMPLES)}: model=mynet")
+    ((kind, name),) = named
+    if asked.config.to is None:
         raise ConfigError(f"to: missing; write to=FOLDER, as in to=./{name}")
-    return partial(begin, kind, name, absolute("to", config.to))
+    return partial(begin, kind, name, absolute("to", asked.config.to), CONF.parent / "examples")
 
 
 VERB = Verb("new", NewConfig, _work, rewrite=_spell_out)

@@ -1,23 +1,20 @@
-"""Overrides as typed, checked before anything is composed for good: keys, options, sweeps, launchers."""
+"""A command line as typed, checked before anything is written: flags, keys, options, sweeps, launchers."""
 
 import argparse
 import itertools
 import math
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
-from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import NoReturn, TypeVar
 
 from hydra import compose
-from hydra._internal.utils import get_args_parser
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, RangeSweep
-from hydra.errors import HydraException, MissingConfigException
-from hydra.types import RunMode
+from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 from yaml import YAMLError
@@ -33,6 +30,76 @@ from atlantis_exp.sessions.launchers import BASIC, Launcher
 T = TypeVar("T")
 
 _MOST_JOBS = 10_000  # of a sweep, and values of a key
+_LAUNCHERS = CONF / "hydra" / "launcher"
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(" ".join(message.split()))
+
+
+_FLAGS = _Parser(add_help=False, allow_abbrev=False)
+_FLAGS.add_argument("overrides", nargs="*")
+_FLAGS.add_argument("--multirun", "-m", action="store_true")
+_FLAGS.add_argument("--cfg", "-c", choices=["job"])
+_FLAGS.add_argument("--resolve", action="store_true")
+_FLAGS.add_argument("--config-dir", "-cd")
+
+
+def flags_of(arguments: Sequence[str]) -> argparse.Namespace:
+    """Return the overrides of a command line and its flags: multirun, cfg, resolve, config_dir. Raises: ConfigError."""
+    flags, unknown = _FLAGS.parse_known_intermixed_args(list(arguments))
+    if unknown:
+        known = {option for action in _FLAGS._actions for option in action.option_strings}
+        raise ConfigError(f"{unknown[0]}: no such flag; {nearest(unknown[0], known)}")
+    if flags.multirun and flags.cfg:
+        raise ConfigError("--cfg job: shows one config; drop -m, and name one value a key")
+    if flags.resolve and not flags.cfg:
+        raise ConfigError("--resolve: is about what is printed instead of the work; add --cfg job")
+    flags.config_dir = flags.config_dir and absolute("--config-dir", flags.config_dir)
+    flags.overrides = [text.lstrip("+") for text in flags.overrides]  # every key is there already
+    return flags
+
+
+def read_flags(arguments: Sequence[str]) -> tuple[list[str], bool]:
+    """Return the overrides of a command line, and whether it is a sweep. Raises: ConfigError."""
+    flags = flags_of(arguments)
+    return flags.overrides, flags.multirun
+
+
+def located(arguments: Sequence[str]) -> list[str]:
+    """Return arguments that mean the same in any folder: `--config-dir` and plugins as absolute paths, flags first.
+
+    Raises:
+        ConfigError: for a flag that there is none of.
+    """
+    flags = flags_of(arguments)
+    return [
+        *([f"--config-dir={flags.config_dir}"] if flags.config_dir else []),
+        *(["-m"] if flags.multirun else []),
+        *(["--cfg", flags.cfg] if flags.cfg else []),
+        *(["--resolve"] if flags.resolve else []),
+        *(re.sub(r"^plugins=(.+)$", _located, text, flags=re.DOTALL) for text in flags.overrides),
+    ]
+
+
+def _located(match: re.Match[str]) -> str:
+    """Return plugins as one list, however they were written."""
+    references = []
+    for text in match[1].removeprefix("[").removesuffix("]").split(","):
+        reference = text.strip().strip("'\"")
+        if "/" in reference or reference.endswith(".py"):
+            reference = str(absolute("plugins", reference))
+        references.append(quoted(reference))
+    return f"plugins=[{','.join(references)}]"
+
+
+def refuse_twice(arguments: Sequence[str]) -> None:
+    """Refuse a key with two values, of which Hydra would take the last. Raises: ConfigError."""
+    given: dict[str, str] = {}
+    for text in read_flags(arguments)[0]:
+        if (before := given.setdefault(key_of(text), text)) != text:
+            raise ConfigError(f"{text}: {before} says something else; write one of the two")
 
 
 def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[tuple[str, ...], T]:
@@ -41,32 +108,23 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
     Raises:
         ConfigError: one line for the first mistake, with the nearest valid choice or the valid range.
     """
-    texts, multirun = read_flags(arguments)
-    overrides = [read_override(text) for text in texts]
+    flags = flags_of(arguments)
+    overrides = [read_override(text) for text in flags.overrides]
     for override in overrides:
-        if override.is_sweep_override() and not multirun:
+        if override.is_sweep_override() and not flags.multirun:
             raise ConfigError(f"{override.input_line}: several values are a sweep; add -m")
-    hydras = [override for override in overrides if _is_hydras(override)]
-    for override in hydras:
-        _refuse_hydras(override)
-        if is_run(arguments):
-            raise ConfigError(f"{override.input_line}: is about the jobs of a sweep; add -m, or leave it out")
+    launcher(arguments)
     overrides = [override for override in overrides if not _is_hydras(override)]
     admit(next((override.value() for override in overrides if override.key_or_group == "plugins"), []))
-    own = config_dir(arguments)
+    own: Path | None = flags.config_dir
     if own is not None:
         _check_config_dir(own)
     if own is not None or admitted():  # whose files may have changed
         _composed.cache_clear()
         _keys.cache_clear()
     try:
-        with composing(own):
-            if hydras:
-                _check_launcher(config_name, hydras)
-            jobs = {tuple(job): _check_job(config_name, schema, job, own) for job in _jobs(overrides)}
-            if own is not None:
-                _refuse_settings_of_hydra(config_name, own, texts, jobs)
-            return jobs
+        with composing():
+            return {tuple(job): _check_job(config_name, schema, job, own) for job in _jobs(overrides)}
     except (HydraException, OmegaConfBaseException) as error:
         reason = f": {error.__cause__}" if isinstance(error.__cause__, OmegaConfBaseException) else ""
         raise ConfigError(" ".join(re.split("Config search path|full_key:", f"{error}{reason}")[0].split())) from None
@@ -79,107 +137,74 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
         raise ConfigError(f"--config-dir={own}: {type(error).__name__}: {reason}") from None
 
 
-def refuse_twice(arguments: Sequence[str]) -> None:
-    """Refuse a key that a person gave two values, of which Hydra would take the last. Raises: ConfigError."""
-    given: dict[str, str] = {}
-    for text in read_flags(arguments)[0]:
-        if (before := given.setdefault(key_of(text), text)) != text:
-            raise ConfigError(f"{text}: {before} says something else; write one of the two")
-
-
-def _refuse_hydras(override: Override) -> None:
-    """Let pass what chooses a launcher and sets it up: anything else of Hydra's names code or places."""
-    key = _key(override)
-    if key == "hydra.mode":
-        raise ConfigError(f"{override.input_line}: write -m for a sweep")
-    is_choice = key == "hydra/launcher" and isinstance(override.value(), str)
-    if override.is_delete() or not (is_choice or key.startswith("hydra.launcher.")):
-        raise ConfigError(
-            f"{override.input_line}: of Hydra's own, hydra/launcher=NAME and hydra.launcher.KEY=VALUE pass"
+def shown(config_name: str, arguments: Sequence[str]) -> str:
+    """Return the composed config of a checked command line as YAML."""
+    flags = flags_of(arguments)
+    with composing():
+        return OmegaConf.to_yaml(
+            _composed(config_name, tuple(flags.overrides), flags.config_dir), resolve=flags.resolve
         )
 
 
 def swept(arguments: Sequence[str]) -> list[str]:
-    """The overrides of a command line that name several values. Raises: ConfigError."""
+    """Return the overrides of a command line that name several values. Raises: ConfigError."""
     return [text for text in read_flags(arguments)[0] if read_override(text).is_sweep_override()]
 
 
-def launcher(config_name: str, arguments: Sequence[str]) -> Launcher:
-    """The launcher of a sweep that a command line asks for. Raises: ConfigError."""
-    texts, multirun = read_flags(arguments)
-    hydras = [text for text in texts if _is_hydras(read_override(text))]
-    if not multirun or not hydras:
+def launcher(arguments: Sequence[str]) -> Launcher:
+    """Return the launcher of a sweep that a command line asks for.
+
+    `hydra/launcher=NAME` chooses it and `hydra.launcher.KEY=VALUE` sets it up. Nothing else of Hydra's passes, as it
+    names code or places.
+
+    Raises:
+        ConfigError: for that, for a launcher that there is none of or that lacks something, for a wrong setting.
+    """
+    texts, is_sweep = read_flags(arguments)
+    overrides = [override for text in texts if _is_hydras(override := read_override(text))]
+    name = "basic"
+    for override in overrides:
+        text, key = override.input_line, _key(override)
+        is_choice = key == "hydra/launcher" and isinstance(override.value(), str)
+        if key == "hydra.mode":
+            raise ConfigError(f"{text}: write -m for a sweep")
+        if override.is_delete() or not (is_choice or key.startswith("hydra.launcher.")):
+            raise ConfigError(f"{text}: of Hydra's own, hydra/launcher=NAME and hydra.launcher.KEY=VALUE pass")
+        if not is_sweep:
+            raise ConfigError(f"{text}: is about the jobs of a sweep; add -m, or leave it out")
+        if is_choice:
+            name = str(override.value())
+    names = ["basic", *(path.stem for path in _LAUNCHERS.glob("*.yaml"))]
+    if name not in names:
+        raise ConfigError(f"hydra/launcher={name}: no such launcher; {nearest(name, names)}")
+    if name == "slurm" and find_spec("submitit") is None:
+        raise ConfigError("hydra/launcher=slurm: needs pip install 'atlantis-exp[slurm]'")
+    if name == "slurm" and shutil.which("srun") is None:
+        raise ConfigError("hydra/launcher=slurm: there is no srun here; submit from a machine of the cluster")
+    settings = DictConfig({}) if name == "basic" else OmegaConf.load(_LAUNCHERS / f"{name}.yaml")
+    assert isinstance(settings, DictConfig)
+    for override in overrides:
+        if "/" not in override.key_or_group:
+            _set_up(settings, override)
+    if name == "basic":
         return BASIC
-    with composing(config_dir(arguments)):
-        settings = compose(config_name, hydras, return_hydra_config=True).hydra
-    name, n_jobs = settings.runtime.choices["hydra/launcher"], OmegaConf.select(settings, "launcher.n_jobs")
-    if (ray := OmegaConf.select(settings, "launcher.ray.init")) is None:
-        return Launcher(name, n_jobs)
-    return Launcher(name, n_jobs, {str(key): ray[key] for key in ray})
-
-
-def _check_launcher(config_name: str, overrides: list[Override]) -> None:
-    """Check what the command line tells Hydra itself, above all of the launcher."""
-    texts = {str(override.input_line): override for override in overrides}
-    choices = [text for text, override in texts.items() if "/" in override.key_or_group]
-    try:
-        settings = compose(config_name, choices, return_hydra_config=True).hydra
-        name, target = settings.runtime.choices["hydra/launcher"], settings.launcher._target_
-        import_module(target.rpartition(".")[0])
-    except ImportError:
-        raise ConfigError(f"hydra/launcher={name}: needs pip install 'atlantis-exp[{name}]'") from None
-    except MissingConfigException as error:  # the plugin's own, which the preset is made of
-        if error.missing_cfg_file != "hydra/launcher/submitit_slurm":
-            raise
-        raise ConfigError("hydra/launcher=slurm: needs pip install 'atlantis-exp[slurm]'") from None
-    if target.endswith(".SlurmLauncher") and shutil.which("srun") is None:
-        raise ConfigError(f"hydra/launcher={name}: there is no srun here; submit from a machine of the cluster")
-    keys = {f"hydra.launcher.{key}" for key in settings.launcher if key not in ("_target_", "submitit_folder")}
-    for text, override in texts.items():
-        key = ".".join(override.key_or_group.split(".")[:3])  # what is below, the user names
-        if key.startswith("hydra.launcher.") and key not in keys:
-            raise ConfigError(f"{text}: no such key; {nearest(key, keys)}")
-    settings = compose(config_name, list(texts), return_hydra_config=True).hydra
-    if OmegaConf.select(settings, "launcher.n_jobs") == 0:
+    if settings.get("n_jobs") == 0:
         raise ConfigError("hydra.launcher.n_jobs=0: should be how many jobs at a time, or -1 for one a core")
+    return Launcher(name, OmegaConf.to_container(settings))  # type: ignore[arg-type]
 
 
-def read_flags(arguments: Sequence[str]) -> tuple[list[str], bool]:
-    """The overrides of a command line, and whether it is a sweep. Raises: ConfigError."""
-    flags = _flags(arguments)
-    return flags.overrides, flags.multirun
-
-
-def is_run(arguments: Sequence[str]) -> bool:
-    """Whether a command line asks for one job, not for a sweep or something to read. Raises: ConfigError."""
-    flags = _flags(arguments)
-    asked = ("multirun", "cfg", "info", "hydra_help", "shell_completion")
-    return not any(getattr(flags, each) for each in asked)
-
-
-def _flags(arguments: Sequence[str]) -> argparse.Namespace:
-    parser = get_args_parser()
-    parser.exit_on_error = parser.allow_abbrev = False
-    try:
-        flags, unknown = parser.parse_known_args(list(arguments))
-    except argparse.ArgumentError as error:
-        raise ConfigError(" ".join(str(error).split())) from None
-    if unknown:
-        if not unknown[0].startswith("-"):
-            raise ConfigError(f"{unknown[0]}: write all overrides together, before or after the flags")
-        known = {option for action in parser._actions for option in action.option_strings}
-        raise ConfigError(f"{unknown[0]}: no such flag; {nearest(unknown[0], known)}")
-    if flags.multirun and (shown := flags.cfg or flags.info):
-        raise ConfigError(
-            f"--{'cfg' if flags.cfg else 'info'} {shown}: shows one config; drop -m, and name one value a key"
-        )
-    for flag in ("resolve", "package"):
-        if getattr(flags, flag) and not flags.cfg and not flags.info:
-            raise ConfigError(f"--{flag}: is about what is printed instead of the work; add --cfg job")
-    for flag in ("config_path", "config_name", "experimental_rerun"):
-        if getattr(flags, flag) is not None:
-            raise ConfigError(f"--{flag.replace('_', '-')}: the verb decides on its config; write overrides instead")
-    return flags
+def _set_up(settings: DictConfig, override: Override) -> None:
+    """Change one setting of a launcher; what is below it, its user names."""
+    key, value = override.key_or_group.removeprefix("hydra.launcher."), override.value()
+    first, _, below = key.partition(".")
+    if first not in settings:
+        known = [f"hydra.launcher.{each!s}" for each in settings]
+        raise ConfigError(f"{override.input_line}: no such key; {nearest(f'hydra.launcher.{first}', known)}")
+    before = settings[first]
+    if isinstance(before, int | str) and type(value) is not type(before):
+        kind = "a number" if isinstance(before, int) else "text"
+        raise ConfigError(f"{override.input_line}: should be {kind}, as {before}")
+    OmegaConf.update(settings, key, value, force_add=bool(below))
 
 
 def read_override(text: str) -> Override:
@@ -244,6 +269,22 @@ def values_of(override: Override) -> list[str]:
     return values
 
 
+def with_first_values(arguments: Sequence[str]) -> list[str]:
+    """Return arguments with the first of the values that a key is given, which others may need to be valid.
+
+    Raises:
+        ConfigError: where there are none.
+    """
+    several = swept(arguments)
+    return [_first_value(text) if text.lstrip("+") in several else text for text in arguments]
+
+
+def _first_value(text: str) -> str:
+    value = read_override(text).value()
+    first = value.start if isinstance(value, IntervalSweep) else values_of(read_override(text))[0]
+    return f"{text.split('=', 1)[0]}={first}"
+
+
 def is_longer(values: RangeSweep, most: int) -> bool:
     """Whether a range has more numbers; not where its step is 0, of which Python has a word to say."""
     assert values.start is not None
@@ -255,14 +296,15 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
     overrides = {text: read_override(text) for text in texts}
     groups = _groups(config_name)
     chosen = tuple(text for text, override in overrides.items() if _key(override) in groups)
+    for text, override in overrides.items():
+        if override.is_delete() and not _key(override).startswith("phase."):
+            raise ConfigError(f"{text}: needed; write {text[1:].partition('=')[0]}=VALUE")
     for text in chosen:
         override = overrides[text]
         folder, value = override.key_or_group, override.value()
         places = (CONF, own) if own is not None else (CONF,)
         options = {path.stem for place in places for path in (place / folder).glob("*.yaml")}
         options |= {component.name for component in admitted().values() if component.kind == folder}
-        if override.is_delete():
-            raise ConfigError(f"{text}: needed; choose with {folder}=OPTION (valid: {', '.join(sorted(options))})")
         if not isinstance(value, str) or value not in options:
             hint = "; one of your own needs plugins=./FILE.py" if folder in KINDS and not admitted() else ""
             raise ConfigError(
@@ -271,55 +313,28 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
             )
     values = {text: override for text, override in overrides.items() if text not in chosen}
     try:
-        if any(each.is_add() or each.is_force_add() or each.is_delete() for each in values.values()):
-            _check_keys(values, _keys(config_name, chosen), groups)
         try:
-            composed = _composed(config_name, tuple(texts))
-        except (HydraException, ValueError) as error:  # mostly no such key; to know all takes as long as to compose
-            for text in chosen:
-                if overrides[text].is_add() and str(error).startswith(f"Multiple values for {_key(overrides[text])}."):
-                    raise ConfigError(f"{text}: the config chooses one already; write {text[1:]}") from None
-            _check_keys(values, _keys(config_name, chosen), groups)
+            composed = _composed(config_name, tuple(texts), own)
+        except (HydraException, ValueError):  # mostly no such key; to know all takes as long as to compose
+            _check_keys(values, _keys(config_name, chosen, own), groups)
             raise
         if OmegaConf.select(composed, "plugins") and "plugins" not in {_key(each) for each in overrides.values()}:
             raise ConfigError(f"--config-dir={own}: names plugins; only the command line may, as plugins=./FILE.py")
         return checked(schema, composed)
     except InterpolationKeyError as error:
         missing = "".join(re.findall("'(.*)'", str(error)))
-        raise ConfigError(f"${{{missing}}}: no such key; {_nearest_key(missing, _keys(config_name, chosen))}") from None
+        raise ConfigError(
+            f"${{{missing}}}: no such key; {_nearest_key(missing, _keys(config_name, chosen, own))}"
+        ) from None
 
 
 def _check_keys(values: Mapping[str, Override], keys: frozenset[str], groups: set[str]) -> None:
-    """Refuse overrides of keys that are not there, that are added though they are, and that are needed."""
+    """Refuse overrides of keys that are not there."""
     branches = {key.rsplit(".", depth)[0] for key in keys for depth in range(1, key.count(".") + 1)}
     for text, override in values.items():
         key = _key(override)
         if key not in keys | branches:
             raise ConfigError(f"{text}: no such key; {_nearest_key(key, keys | branches | groups)}")
-        if override.is_add() and key in keys:
-            raise ConfigError(f"{text}: the key is there already; write {text.removeprefix('+')}")
-        if override.is_delete() and not key.startswith("phase."):
-            raise ConfigError(f"{text}: needed; change it with {key}=VALUE")
-
-
-def located(arguments: Sequence[str]) -> list[str]:
-    """Arguments that mean the same in any folder: `--config-dir` and plugins as absolute paths. Raises: ConfigError.
-
-    Plugins are one list however they were written, and `--config-dir` comes first.
-    """
-    arguments = [re.sub(r"^plugins=(.+)$", _located, argument, flags=re.DOTALL) for argument in arguments]
-    if (folder := config_dir(arguments)) is None:
-        return arguments
-    arguments = [argument for argument in arguments if not re.match(r"(--config-dir|-cd)=", argument)]
-    if (flag := next((at for at, text in enumerate(arguments) if text in ("--config-dir", "-cd")), None)) is not None:
-        del arguments[flag : flag + 2]
-    return [f"--config-dir={folder}", *arguments]
-
-
-def config_dir(arguments: Sequence[str]) -> Path | None:
-    """The folder of a person's own options that a command line names. Raises: ConfigError."""
-    folder = _flags(arguments).config_dir
-    return None if folder is None else absolute("--config-dir", folder)
 
 
 def _check_config_dir(folder: Path) -> None:
@@ -334,58 +349,22 @@ def _check_config_dir(folder: Path) -> None:
             raise ConfigError(f"{taken[0]}: {group.name}={taken[0].stem} is ours and is not replaced; rename yours")
 
 
-def _refuse_settings_of_hydra(
-    config_name: str, folder: Path, typed: Sequence[str], jobs: Iterable[Sequence[str]]
-) -> None:
-    """Raise ConfigError where options of a person's own change what Hydra does, which is to run code."""
-    hydras = [text for text in typed if _is_hydras(read_override(text))]
-    plain = _hydras_own(config_name, hydras)
-    # A sweep itself is composed, too, with the groups that have several options as they are without.
-    for texts in (typed, *([*hydras, *job] for job in jobs)):
-        if changed := sorted(key for key, value in _hydras_own(config_name, texts).items() if value != plain.get(key)):
-            raise ConfigError(f"--config-dir={folder}: sets hydra.{changed[0]}, which may name code; drop it there")
-
-
-def _hydras_own(config_name: str, texts: Sequence[str]) -> dict[str, Any]:
-    """Hydra's settings without what follows from the overrides of ours in `texts` alone."""
-    composer = GlobalHydra.instance().hydra
-    assert composer is not None
-    composed = composer.compose_config(config_name, list(texts), RunMode.MULTIRUN, validate_sweep_overrides=False)
-    settings: Any = OmegaConf.to_container(composed.hydra, resolve=False)
-    del settings["job"]["override_dirname"], settings["runtime"]["choices"]
-    typed = [text for text in texts if not _is_hydras(read_override(text))]
-    settings["overrides"]["task"] = settings["overrides"]["task"] != typed
-    return {str(key): value for key, value in settings.items()}
-
-
-def _located(match: re.Match[str]) -> str:
-    references = []
-    for text in match[1].removeprefix("[").removesuffix("]").split(","):
-        reference = text.strip().strip("'\"")
-        if "/" in reference or reference.endswith(".py"):
-            reference = str(absolute("plugins", reference))
-        references.append(quoted(reference))
-    return f"plugins=[{','.join(references)}]"
-
-
 def _offered(folder: str, name: str) -> str:
     """What to write for an option that an installed distribution offers; empty where none does."""
-    offers = [each for parts in installed().values() for each in parts if (each.kind, each.name) == (folder, name)]
-    if not offers or not offers[0].plugin:
-        return ""
-    plugins = ", ".join(f"plugins={each.plugin.name} ({each.plugin})" for each in offers if each.plugin)
-    return f"{folder}={name}: add {plugins}"
+    offers = [f"plugins={plugin}" for plugin, names in installed().items() if folder in KINDS and name in names]
+    return f"{folder}={name}: add {' or '.join(offers)}" if offers else ""
 
 
 @cache
-def _composed(config_name: str, texts: tuple[str, ...]) -> DictConfig:
-    return compose(config_name, list(texts))
+def _composed(config_name: str, texts: tuple[str, ...], own: Path | None) -> DictConfig:
+    """Compose a config; `own` is a folder with further options, which come behind ours."""
+    return compose(config_name, [*texts, *([f"hydra.searchpath=[{quoted(f'file://{own}')}]"] if own else [])])
 
 
 @cache
-def _keys(config_name: str, chosen: tuple[str, ...]) -> frozenset[str]:
+def _keys(config_name: str, chosen: tuple[str, ...], own: Path | None) -> frozenset[str]:
     """The keys that options of groups give, which many jobs of a sweep share."""
-    tree = OmegaConf.to_container(_composed(config_name, chosen))
+    tree = OmegaConf.to_container(_composed(config_name, chosen, own))
     assert isinstance(tree, dict)
     return frozenset(flatten({str(key): value for key, value in tree.items()}))
 

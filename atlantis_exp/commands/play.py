@@ -26,7 +26,7 @@ class PlayConfig:
 def _work(asked: Asked[PlayConfig]) -> Callable[[], None]:
     from atlantis_exp.sessions.evaluating import play
 
-    return partial(play, **vars(asked.config), command=asked.command)
+    return partial(play, **vars(asked.config), command=asked.command, cores=asked.machine.cores)
 
 
 VERB = Verb("play", PlayConfig, _work)

@@ -2,24 +2,29 @@
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
+from atlantis_exp.commands.compare import list_out
 from atlantis_exp.config import STRICT, PathsConfig
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class ReportConfig:
-    """The table of what a store holds."""
+    """Which runs the table has."""
 
+    runs: list[str]  # names, starts of names or patterns; none: all
+    where: list[str]  # KEY=VALUE; none: all
     paths: PathsConfig
 
 
 def _work(asked: Asked[ReportConfig]) -> Callable[[], None]:
     from atlantis_exp.sessions.reporting import report
 
-    return partial(report, paths=asked.config.paths)
+    config = asked.config
+    return partial(report, Path(config.paths.outputs), config.runs, config.where)
 
 
-VERB = Verb("report", ReportConfig, _work)
+VERB = Verb("report", ReportConfig, _work, rewrite=list_out)

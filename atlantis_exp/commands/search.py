@@ -10,13 +10,17 @@ from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.jobs import training_of
-from atlantis_exp.commands.overrides import refuse_twice, swept
-from atlantis_exp.config import FREE, STRICT, Config, Count
+from atlantis_exp.commands.overrides import key_of, refuse_twice, swept, with_first_values
+from atlantis_exp.components import Count
+from atlantis_exp.config import FREE, STRICT, Config
 from atlantis_exp.faults import ConfigError, Fault
-from atlantis_exp.sessions.job import command_line
+from atlantis_exp.sessions.job import command_line, replaced
 
 if TYPE_CHECKING:
-    from atlantis_exp.sessions.search import Request
+    from atlantis_exp.sessions.search import Search
+
+
+_FIRST_SEED = 1_000  # behind all that `decide` trains
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -32,6 +36,7 @@ class SearchConfig(Config):
     """A search for the best values of some keys of a training's config, which is the rest of this one."""
 
     trials: Count
+    seeds: Count  # trainings a trial
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,59}$")] | None
     startup: Annotated[int, Field(ge=0)]  # trials drawn at random
     pruning: PruningConfig
@@ -41,6 +46,8 @@ class SearchConfig(Config):
         super().__post_init__()
         if not self.evaluation.at_end:
             raise ConfigError("evaluation.at_end=false: a search compares its trials by the evaluation at their end")
+        if self.seed < _FIRST_SEED:
+            raise ConfigError(f"seed={self.seed}: write 1_000 or more; decide tests the best values with seeds below")
 
 
 _OWN = {field.name for field in dataclasses.fields(SearchConfig)} - {field.name for field in dataclasses.fields(Config)}
@@ -48,13 +55,12 @@ CLOSED = _OWN | FREE | {"seed", "evaluation"}
 """What no searched key may begin with."""
 
 
-def _without_searched(arguments: list[str]) -> list[str]:
-    """Leave out the keys that are given several values, which are those to search."""
+def _first_trial(arguments: list[str]) -> list[str]:
+    """Take the first of the values that a key is to be searched among."""
     if {"-m", "--multirun"} & set(arguments):
         raise ConfigError("-m: a search is no sweep, it tries one set of values after the other; drop -m")
     refuse_twice([argument.removeprefix("space.") for argument in arguments])
-    searched = swept(arguments)
-    return [argument for argument in arguments if argument not in searched]
+    return with_first_values(arguments)
 
 
 def _work(asked: Asked[SearchConfig]) -> Callable[[], None]:
@@ -62,33 +68,37 @@ def _work(asked: Asked[SearchConfig]) -> Callable[[], None]:
         from atlantis_exp.sessions.search import search
     except ImportError:
         raise Fault("search needs Optuna: pip install 'atlantis-exp[search]'", exit_code=2) from None
-    return partial(search, request_of(asked))
+    return partial(search, search_of(asked))
 
 
-def request_of(asked: Asked[SearchConfig]) -> "Request":
-    """The search that was asked for. Raises: ConfigError where a value of the space makes no valid config."""
+def search_of(asked: Asked[SearchConfig]) -> "Search":
+    """Return the search that was asked for. Raises: ConfigError where a value of the space makes no valid config."""
     from atlantis_exp.commands.space import check_space, read_space
-    from atlantis_exp.sessions.search import Request
+    from atlantis_exp.sessions.search import Search
 
     config, searched = asked.config, swept(asked.typed)
     texts = config.space | dict(text.removeprefix("space.").split("=", 1) for text in searched)
     if not texts:
         raise ConfigError("nothing to search: give a key several values, as in optimizer=adam,rmsprop")
-    overrides = [text for text in asked.overrides if text.lstrip("+~").split("=")[0].split(".")[0] not in _OWN]
+    keys = {key_of(text) for text in searched}
+    fixed = [text for text in asked.overrides if key_of(text) not in keys]
+    own = [text for text in fixed if text.lstrip("+~").split("=")[0].split(".")[0] in _OWN]
+    overrides = replaced([text for text in fixed if text not in own], f"seed={config.seed}")
     space = read_space(texts, CLOSED)
-    return Request(
+    return Search(
         space=space,
         texts=texts,
         overrides=overrides,
         job_of=training_of,
         corner=check_space(space, overrides),
         trials=config.trials,
+        seeds=config.seeds,
         name=config.name,
         startup=config.startup,
         pruned_after=config.pruning.trials,
         spared=config.pruning.evaluations,
-        command=command_line("search", *asked.overrides, *searched),
+        command=command_line("search", *fixed, *searched),
     )
 
 
-VERB = Verb("search", SearchConfig, _work, rewrite=_without_searched)
+VERB = Verb("search", SearchConfig, _work, rewrite=_first_trial)

@@ -12,14 +12,18 @@ from atlantis_exp.commands.overrides import check, is_longer, key_of, read_flags
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import Job
-from atlantis_exp.sessions.space import Space
 
 _CORNERS = 32  # configs that are composed before a search starts, at 0.1 s each; a larger space is checked by its edges
 _MOST_NUMBERS = 100_000  # of a range with fractions
 
 
+Distribution = CategoricalDistribution | FloatDistribution | IntDistribution
+Space = Mapping[str, Distribution]
+"""The distribution of each key; a choice's values are texts, as an override has them."""
+
+
 def read_space(texts: Mapping[str, str], closed: set[str]) -> Space:
-    """The distributions that the texts describe: `choice(a, b)`, `tag(log, interval(1e-5, 1e-3))`.
+    """Return the distributions that the texts describe: `choice(a, b)`, `tag(log, interval(1e-5, 1e-3))`.
 
     closed: what no searched key may begin with.
 
@@ -29,7 +33,7 @@ def read_space(texts: Mapping[str, str], closed: set[str]) -> Space:
     return {key: _read(key, text, closed) for key, text in texts.items()}
 
 
-def _read(key: str, text: str, closed: set[str]) -> CategoricalDistribution | FloatDistribution | IntDistribution:
+def _read(key: str, text: str, closed: set[str]) -> Distribution:
     override = read_override(f"{key}={text}")
     if override.key_or_group != key:  # as `++seed` or `sampler@samplers.uniform`, which MLflow takes no name from
         raise ConfigError(

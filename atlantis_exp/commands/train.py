@@ -1,10 +1,10 @@
 """`python -m atlantis_exp [train] overrides`: one run; the same command again continues or reports it."""
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from dataclasses import replace
 from functools import partial
 
-from atlantis_exp.commands.app import Asked, Verb
+from atlantis_exp.commands.app import Asked, Verb, in_turn
 from atlantis_exp.commands.jobs import job_of
 from atlantis_exp.commands.overrides import swept
 from atlantis_exp.config import Config
@@ -13,33 +13,38 @@ from atlantis_exp.sessions.launchers import Launcher
 
 
 def _work(asked: Asked[Config]) -> Callable[[], object]:
-    job = job_of(asked)
-    match asked.launcher:
-        case None:
-            from atlantis_exp.sessions.training import train
+    from atlantis_exp.sessions.training import train
 
-            return partial(train, job)
-        case "joblib":
-            from atlantis_exp.sessions.launchers.joblib import train_apart
-
-            return partial(train_apart, job)
-        case "ray":
-            from atlantis_exp.sessions.launchers.ray import train_there
-
-            return partial(train_there, job)
-        case _:
-            from atlantis_exp.sessions.launchers.slurm import train_as_job
-
-            return partial(train_as_job, job)
+    return partial(train, job_of(asked))
 
 
-def _sweep(
-    asked: Sequence[Asked[Config]], launcher: Launcher, arguments: Sequence[str]
-) -> AbstractContextManager[None]:
+def _sweep(asked: Sequence[Asked[Config]], launcher: Launcher, arguments: Sequence[str]) -> None:
     from atlantis_exp.sessions.sweep import ledger
 
+    if len(asked) == 1 and launcher.is_basic:
+        in_turn(_work, asked)
+        return
     jobs = [job_of(each) for each in asked]
-    return ledger(jobs, swept(arguments), launcher, command_line(*arguments))
+    with ledger(jobs, swept(arguments), launcher, command_line(*arguments)):
+        match launcher.name:
+            case "joblib":
+                from atlantis_exp.sessions.launchers.joblib import train_side_by_side
+
+                train_side_by_side(jobs, launcher)
+            case "slurm":
+                from atlantis_exp.sessions.launchers.slurm import submit
+
+                submit(jobs, launcher, _train_on_a_node)
+            case _:
+                in_turn(_work, asked)
+
+
+def _train_on_a_node(overrides: Sequence[str]) -> None:
+    """Train what one job's overrides ask for, in a process that Slurm has started. Raises: Fault."""
+    from atlantis_exp.sessions.training import train
+
+    (asked,) = VERB.asked(overrides)
+    train(job_of(replace(asked, machine=replace(asked.machine, launcher="slurm"))))
 
 
 VERB = Verb("train", Config, _work, config_name="config", sweep=_sweep)

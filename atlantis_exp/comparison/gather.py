@@ -1,35 +1,29 @@
-"""Run folders to runs that can be compared; what cannot be is named with its reason."""
+"""Read run folders; what cannot be read is named with a reason."""
 
-import json
+import csv
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from math import isfinite
+from math import isfinite, nan
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from atlantis_exp.checking import flatten, nearest, parse, to_dict
-from atlantis_exp.components import Component, facts_of, game_of, title_of
+from atlantis_exp.components import Component, facts_of, game_of
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
-from atlantis_exp.registry import Game
+from atlantis_exp.games import Game
 from atlantis_exp.runs.episodes import EpisodeTable
-from atlantis_exp.runs.facts import read_tags
-from atlantis_exp.runs.folder import BEST_EPISODE, EVALUATION, RESULT, RunFolder, evaluation_at
+from atlantis_exp.runs.facts import read_facts, read_tags
+from atlantis_exp.runs.folder import BEST_EPISODE, EVALUATION, RESULT, RunFolder
 from atlantis_exp.runs.journal import curve
 
 Array = npt.NDArray[np.float64]
-
-PROTOCOL = (
-    *("env.id", "env.frameskip", "env.sticky", "env.max_frames", "env.max_steps", "env.noop_max", "env.max_pool"),
-    *("env.crop", "evaluation.epsilon"),
-)
-"""What must be equal for scores to mean the same; the observation's size belongs to the network."""
 
 AXES = {"frames": "equal frames", "hours": "equal hours", "flops": "equal gradient FLOPs"}
 """The three fair views: column of a learning curve to what is equal."""
@@ -41,41 +35,72 @@ _CURVE = {
     "epsilon": "actions/epsilon",
     "score": "score/mean_100",
 }
-_POINT = ("throughput/frames", "score/mean_100")  # what tells a point of the curve from other metrics
 
-COMMIT = "git.commit"
-"""The key whose values are commits."""
-_COMMIT_DIGITS = 10
-
-_PLAYERS = ("agent", "player")  # the config's key of what has no network: a baseline, a person
+PUT_ASIDE = "put aside by resume=never"
+NOT_STARTED = "foreign: it has no config.json"
+"""Reasons for which a folder is left out that are no damage."""
+UNREADABLE = (Fault, ValueError, KeyError, TypeError, AttributeError, OSError, OverflowError, csv.Error)
+"""The errors of a damaged folder."""
+_OWN_EVALUATION = re.compile(r"evaluation/(\d{1,18})\.csv")
 
 
 @dataclass(frozen=True)
-class Training:
-    """A finished training: its config, its learning curve and its evaluation after the last step."""
+class Evaluated:
+    """An evaluation of a run, its own or one that the verb `evaluate` made."""
+
+    folder: RunFolder  # that holds it
+    artifact: str  # its episodes
+    source: str  # training, evaluate, baseline or human
+    step: int
+    epsilon: float  # NaN without a network
+    seed: int | None
+
+    @property
+    def path(self) -> Path:
+        """The table of its episodes."""
+        return self.folder.artifact(self.artifact)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What runs are chosen and grouped by."""
 
     name: str
-    config: dict[str, Any]  # dotted keys; the epsilon of the evaluation taken, and the budget if it ended the training
-    science: dict[str, Any]  # the dotted keys that decide its numbers
-    curve: dict[str, Array]  # frames, hours, flops (where recorded), epsilon, score (mean of the last 100 episodes)
-    episodes: EpisodeTable
-    tags: dict[str, str]  # what the run says about itself: device, precision, git.commit, versions
-    policy: str  # in words, what the network did most in these episodes; empty where nobody said
-    film: Path | None = None  # of one of these episodes, if there is one
+    config: dict[str, Any]  # dotted keys
+    tags: dict[str, str]  # device, precision, git.commit, versions
 
     @property
     def facts(self) -> dict[str, Any]:
-        """All that runs can be told apart by: the config and, where it has no such key, the tags.
-
-        The device is the tag's: that which the config's `auto` has become.
-        """
-        device = {key: value for key, value in self.tags.items() if key == "device"}
-        return {**self.tags, **self.config, **device}
+        """Config and tags; the config wins, except that the tag `device` says which one `auto` has become."""
+        return {**self.tags, **self.config, **{key: value for key, value in self.tags.items() if key == "device"}}
 
     @property
     def game(self) -> Component | None:
-        """The game; None where it is a plugin's that no command line names."""
-        return game_of(self.config["env.id"])
+        """The game; None for a plugin's that is not loaded."""
+        return game_of(str(self.config.get("env.id")))
+
+
+@dataclass(frozen=True)
+class StoredRun(Run):
+    """A run folder, finished or not, as far as it is read to choose it."""
+
+    folder: RunFolder
+    trained: Config | None  # None of a player: a baseline, a person or exported weights
+    evaluations: list[Evaluated]  # its own by step, then those of the verb `evaluate` by age
+
+
+@dataclass(frozen=True)
+class Training(Run):
+    """A finished training, with its learning curve and its evaluation after the last step.
+
+    Its config has the epsilon of that evaluation, and a budget only if it ended the training.
+    """
+
+    science: dict[str, Any]  # the dotted keys that decide its numbers
+    curve: dict[str, Array]  # frames, hours, flops (where recorded), epsilon, score (mean of the last 100 episodes)
+    episodes: EpisodeTable
+    policy: str = ""  # what the network did most in these episodes, in words; empty if not recorded
+    film: Path | None = None  # of one of these episodes
 
     @property
     def has_collapsed(self) -> bool:
@@ -84,17 +109,15 @@ class Training:
 
 
 @dataclass(frozen=True)
-class Player:
-    """A baseline, a person or exported weights: what was not trained here."""
+class Player(Run):
+    """A baseline, a person or exported weights: not trained here."""
 
-    name: str
-    config: dict[str, Any]  # dotted keys
     episodes: EpisodeTable
-    film: Path | None = None  # of one of these episodes, if there is one
+    film: Path | None = None  # of one of these episodes
 
     @property
     def called(self) -> str:
-        """How people call it."""
+        """Its name for people."""
         if "weights" in self.config:
             return f"weights {self.config['weights']}"
         if "player" in self.config:
@@ -104,73 +127,214 @@ class Player:
         return "random player"
 
 
-class _Later(NamedTuple):
-    """An evaluation that the verb `evaluate` made of a training."""
+@dataclass
+class Stored:
+    """The runs of an outputs folder, and those left out: a folder's name to the reason."""
 
-    made: int  # ms since 1970
-    step: int
-    epsilon: float
-    folder: RunFolder
+    runs: list[StoredRun] = field(default_factory=list)
+    exported: list[StoredRun] = field(default_factory=list)  # weights, by their latest evaluation at each epsilon
+    skipped: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass
 class Gathered:
-    """What the outputs folder holds, and what of it was left aside: a folder's name to the reason."""
+    """The finished runs of an outputs folder, and those left out: a folder's name to the reason."""
 
     trainings: list[Training] = field(default_factory=list)
     players: list[Player] = field(default_factory=list)
     skipped: dict[str, str] = field(default_factory=dict)
+    lost: list[StoredRun] = field(default_factory=list)  # trainings among `skipped`: unfinished, failed or damaged
 
 
 class _Unusable(ValueError):
-    """A run that cannot be compared, and why."""
+    """Why a sound folder cannot be used."""
+
+
+def read_runs(outputs: Path, runs: Sequence[str] = (), put_aside: bool = False) -> Stored:
+    """Read configs, tags and evaluations of all runs under `outputs`, without their episodes and curves.
+
+    Args:
+        runs: names, starts of names, patterns or a decision's name; empty for all. Players are read in any case.
+        put_aside: whether to read runs that resume=never put aside.
+    """
+    patterns, stored = named_by(outputs, runs), Stored()
+    later = _evaluations(outputs, stored)
+    for folder in [RunFolder(path) for path in sorted((outputs / "runs").glob("*")) if path.is_dir()]:
+        is_asked = fits(folder.name, patterns)
+        try:
+            if "~" in folder.name and not put_aside:
+                raise _Unusable(PUT_ASIDE)
+            if not folder.has_started:
+                raise _Unusable(NOT_STARTED)
+            tree = folder.config
+            if is_asked or "model" not in tree:
+                stored.runs.append(_open(folder, tree, later[folder.name]))
+        except UNREADABLE as error:
+            if is_asked:
+                stored.skipped[folder.name] = _reason(error)
+    return stored
+
+
+def _open(folder: RunFolder, tree: dict[str, Any], later: Sequence[Evaluated]) -> StoredRun:
+    facts = read_facts(folder.path)
+    if "model" in tree:
+        trained = parse(Config, tree)
+        of = trained.evaluation.epsilon, trained.evaluation.seed
+        steps = [(name, int(own[1])) for name in facts.artifacts if (own := _OWN_EVALUATION.fullmatch(name))]
+        evaluations = [Evaluated(folder, name, "training", step, *of) for name, step in steps]
+        evaluations += [each for each in later if not is_of_another(each.folder, folder)]
+        return StoredRun(folder.name, flatten(to_dict(trained)), facts.tags, folder, trained, evaluations)
+    if "agent" in tree or "player" in tree:
+        config, source = flatten(tree), facts.tags.get("atlantis.kind", "baseline")
+        seed = config.get("evaluation.seed")
+        evaluations = [Evaluated(folder, EVALUATION, source, 0, nan, seed)] if EVALUATION in facts.artifacts else []
+        return StoredRun(folder.name, config, facts.tags, folder, None, evaluations)
+    raise _Unusable("foreign: its config.json is not one of ours")
+
+
+def _evaluations(outputs: Path, stored: Stored) -> dict[str, list[Evaluated]]:
+    """Return the finished runs of the verb `evaluate` by the run they evaluate, by age; put exported weights aside."""
+    found: list[tuple[int, str, dict[str, Any], Evaluated]] = []
+    for path in (outputs / "evaluations").glob(f"*/{RESULT}"):
+        folder = RunFolder(path.parent)
+        try:
+            facts, commit = folder.config, folder.commit
+            if commit is None or not {"run", "weights"} & facts.keys():
+                continue
+            if not isfinite(epsilon := float(facts["evaluation"]["epsilon"])):
+                raise ValueError("its epsilon is not a number")
+            step = int(facts["step"]) if "run" in facts else 0
+            each = Evaluated(folder, EVALUATION, "evaluate", step, epsilon, facts["evaluation"].get("seed"))
+            found.append((commit.updated, folder.name, facts, each))
+        except UNREADABLE as error:
+            stored.skipped[f"evaluations/{folder.name}"] = _reason(error)
+    trained: dict[str, list[Evaluated]] = defaultdict(list)
+    exported: dict[tuple[str, float], StoredRun] = {}
+    for _, name, facts, each in sorted(found, key=lambda made: made[:2]):
+        if "run" in facts:
+            trained[str(facts["run"])].append(each)
+        else:
+            exported[str(facts.get("sha256")), each.epsilon] = StoredRun(
+                name, flatten(facts), {}, each.folder, None, [each]
+            )
+    stored.exported = [*exported.values()]
+    return trained
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, _Unusable):
+        return str(error)
+    return f"broken: {'it lacks ' if isinstance(error, KeyError) else ''}{error}"
 
 
 def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None, put_aside: bool = False) -> Gathered:
-    """Read all finished runs under `outputs`, trainings only if their name begins with or fits one of the `runs`.
+    """Read all finished trainings and players under `outputs`; `runs` and `put_aside` as for `read_runs`.
 
-    A training's episodes are those of its latest evaluation after its last step, be it the training's own or one that
-    the verb `evaluate` made; given `epsilon`, of the latest at that epsilon. What resume=never put aside is left out
-    unless it is asked for, as it is where commits are compared: it is what an earlier one made of the same recipe.
-    The name of a decision among `runs` stands for the runs that it rests on. Exported weights are players by their
-    latest evaluation.
+    A training's episodes are those of its latest evaluation after its last step, its own or one that the verb
+    `evaluate` made; given `epsilon`, of the latest at that epsilon.
     """
-    patterns = named_by(outputs, runs)
-
-    def is_asked_for(name: str) -> bool:
-        return not runs or fits(name, patterns)
-
-    gathered = Gathered()
-    evaluations, exported = _evaluations(outputs, gathered.skipped)
-    gathered.players += exported
-    for folder in [RunFolder(path) for path in sorted((outputs / "runs").glob("*")) if path.is_dir()]:
-        is_asked = is_asked_for(folder.name)
+    stored, patterns = read_runs(outputs, runs, put_aside), named_by(outputs, runs)
+    gathered = Gathered(skipped=stored.skipped)
+    for run in (*stored.runs, *stored.exported):
         try:
-            tree = _config(folder, put_aside)
-            if any(key in tree for key in _PLAYERS):
-                gathered.players.append(_player(folder, tree))
-                continue
-            if not is_asked:
-                continue
-            gathered.trainings.append(_training(folder, parse(Config, tree), evaluations.get(folder.name, []), epsilon))
-        except (Fault, ValueError, KeyError, TypeError, OSError) as error:
-            if is_asked:
-                gathered.skipped[folder.name] = f"{'' if isinstance(error, _Unusable) else 'broken: '}{error}"
+            if run.trained is None:
+                gathered.players.append(_player(run))
+            else:
+                gathered.trainings.append(_training(run, run.trained, epsilon))
+        except UNREADABLE as error:
+            if run.trained is not None:
+                gathered.lost.append(run)
+            if fits(run.name, patterns):
+                gathered.skipped[run.name] = _reason(error)
     return gathered
 
 
+def _training(run: StoredRun, config: Config, epsilon: float | None) -> Training:
+    folder = run.folder
+    if folder.result is None:
+        state = f"failed: {folder.error}" if folder.state == "failed" else "unfinished"
+        raise _Unusable(f"{state}: the command that started it continues it")
+    if (result := folder.ended(config.budget.steps)) is None:
+        raise _Unusable("unfinished: it was made longer; the command that did so continues it")
+    at_end = [each for each in run.evaluations if each.step == result.steps and each.path.exists()]
+    if not (taken := [each for each in at_end if epsilon in (None, each.epsilon)]):
+        wanted = "" if epsilon is None else f" at epsilon {epsilon}"
+        raise _Unusable(f"no evaluation{wanted} after its last step: evaluate run={folder.name} makes one")
+    latest = taken[-1]
+    is_own = latest.folder == folder
+    is_filmed = not is_own or run.tags.get("best_evaluation", "").endswith(f" at step {result.steps}")
+    science = config.science()
+    science["phase"] = {str(index): phase for index, phase in enumerate(science["phase"])}
+    budget = config.budget.steps if result.outcome == "budget" else None
+    return Training(
+        folder.name,
+        run.config | {"evaluation.epsilon": latest.epsilon, "budget.steps": budget},
+        run.tags,
+        science=flatten(science),
+        curve=_curve(folder.path, run.tags),
+        episodes=_episodes(latest, facts_of(run.game)),
+        policy=(run.tags if is_own else read_tags(latest.folder.path)).get("policy", ""),
+        film=latest.folder.artifact(BEST_EPISODE) if is_filmed else None,
+    )
+
+
+def _player(run: StoredRun) -> Player:
+    if run.folder.result is None or not run.evaluations:
+        raise _Unusable("unfinished: the command that started it continues it")
+    episodes = _episodes(run.evaluations[-1], Game())
+    return Player(run.name, run.config, run.tags, episodes, run.folder.artifact(BEST_EPISODE))
+
+
+def _curve(folder: Path, tags: Mapping[str, str]) -> dict[str, Array]:
+    recorded = curve(folder, (_CURVE["frames"], _CURVE["score"]))
+    points = np.array([[point.values[key] for key in _CURVE.values()] for point in recorded])
+    arrays = dict(zip(_CURVE, points.T, strict=True)) if len(points) else {}
+    if (updates := arrays.pop("updates", None)) is not None and "flops_per_update" in tags:
+        arrays["flops"] = updates * float(tags["flops_per_update"])
+    return arrays
+
+
+def _episodes(evaluated: Evaluated, game: Game) -> EpisodeTable:
+    """Read an evaluation's episodes, with the points of the game's sources. Raises: ValueError, OSError."""
+    path = evaluated.path
+    episodes = EpisodeTable.read(path, game.sources)
+    if not np.isfinite(episodes.scores).all():
+        raise ValueError(f"{path} has a score that is not a finite number")
+    others = (episodes.steps, episodes.frames, episodes.truncated, episodes.counts)
+    if not all(np.isfinite(each).all() for each in others):
+        raise ValueError(f"{path} has a count that is not a finite number")
+    if game.actions and episodes.actions != game.actions:
+        raise ValueError(f"{path} has other actions than the game")
+    return episodes
+
+
+def is_of_another(evaluation: RunFolder, run: RunFolder) -> bool:
+    """Return whether an evaluation is older than the run: of an earlier one of that name, which was put aside."""
+    made, begun = evaluation.commit, run.commit
+    return made is not None and begun is not None and made.updated < begun.started
+
+
 def named_by(outputs: Path, runs: Iterable[str]) -> list[str]:
-    """The names, their starts and patterns that `runs` is; a decision's name is those of its runs. Raises: Fault."""
+    """Return the names, starts of names and patterns of `runs`, a decision's name replaced by those of its runs."""
     return [pattern for text in runs for pattern in _runs_of_decision(outputs, text) or [text]]
 
 
-def fits(name: str, patterns: Iterable[str]) -> bool:
-    """Whether a run's name begins with or fits one of the patterns."""
-    return any(fnmatchcase(name, f"{pattern}*") for pattern in patterns)
+def fits(name: str, patterns: Sequence[str]) -> bool:
+    """Return whether a run's name starts with or matches one of the patterns; true without any.
+
+    A pattern that ends with a seed is not the start of a longer one: `cnn-uniform-s1` does not match s10.
+    """
+
+    def longer(pattern: str) -> str:
+        return "[!0-9]*" if re.search(r"s\d+$", pattern) else "*"
+
+    return not patterns or any(
+        fnmatchcase(name, pattern) or fnmatchcase(name, pattern + longer(pattern)) for pattern in patterns
+    )
 
 
 def refuse_unknown(outputs: Path, runs: Iterable[str]) -> None:
-    """Raise ConfigError where a text of `runs` fits no run that is there."""
+    """Raise ConfigError for a text of `runs` that no run matches."""
     names = [path.name for path in (outputs / "runs").glob("*") if path.is_dir()]
     for text in runs if names else ():
         patterns = named_by(outputs, [text])
@@ -179,229 +343,7 @@ def refuse_unknown(outputs: Path, runs: Iterable[str]) -> None:
 
 
 def _runs_of_decision(outputs: Path, name: str) -> list[str]:
-    """The runs that a decision rests on, none where there is no decision of that name. Raises: Fault."""
+    """Return the runs of a decision; none if there is no decision of that name. Raises: Fault."""
     folders = [RunFolder(path) for path in (outputs / "decisions").glob("decide-*") if path.name == name]
     found = [folder.config.get("runs") for folder in folders]
     return [run for runs in found if isinstance(runs, list) for run in runs if isinstance(run, str)]
-
-
-def select(trainings: Iterable[Training], where: Sequence[str]) -> list[Training]:
-    """The trainings whose configs hold all of KEY=VALUE, with keys as `group` takes them. Raises: ConfigError."""
-    selected = list(trainings)
-    for text in where:
-        key, equals, value = text.partition("=")
-        if not equals:
-            raise ConfigError(f"where={text}: write KEY=VALUE, as in where=model=cnn,seed=0")
-        _check_key("where", key, selected)
-        selected = [run for run in selected if _is(run.facts.get(resolve(key, run.facts)), value)]
-    return selected
-
-
-def group(trainings: Iterable[Training], by: Sequence[str]) -> dict[str, list[Training]]:
-    """Trainings by the values of config keys or tags, `model` being short for `model.name`; in order of their labels.
-
-    Raises:
-        ConfigError: on a key that no training has.
-    """
-    trainings = list(trainings)
-    for key in by:
-        _check_key("by", key, trainings)
-    groups = defaultdict(list)
-    for training in trainings:
-        groups[" ".join(values_of(training, by)) or "all"].append(training)
-    return dict(sorted(groups.items()))
-
-
-def values_of(training: Training, by: Sequence[str]) -> tuple[str, ...]:
-    """How people call a training's value of each key; a commit by its first digits."""
-    return values_in(training.facts, by)
-
-
-def values_in(facts: Mapping[str, Any], by: Sequence[str]) -> tuple[str, ...]:
-    """How people call the value of each key in a training's facts."""
-    values = []
-    for key in by:
-        name = resolve(key, facts)
-        value = facts.get(name)
-        text = value if isinstance(value, str) else f"{name.rsplit('.')[-1] or key}={json.dumps(value)}"
-        values.append(text[:_COMMIT_DIGITS] if name == COMMIT else text)
-    return tuple(values)
-
-
-def resolve(key: str, config: Mapping[str, Any]) -> str:
-    """The dotted key that a short one means in a config, empty if there is none: `model` for `model.name`."""
-    return next((name for name in (key, f"{key}.name", f"{key}.id") if name in config), "")
-
-
-def shortened(keys: Iterable[str], facts: Mapping[str, Any]) -> tuple[str, ...]:
-    """Keys as people call them, each once: `model` for `model.name`; in alphabetical order of the whole ones."""
-    short = []
-    for key in sorted(keys, key=lambda key: resolve(key, facts)):
-        stem = key.removesuffix(".name").removesuffix(".id")
-        short.append(stem if resolve(stem, facts) == key else key)
-    return tuple(dict.fromkeys(short))
-
-
-def mixed_protocol(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -> tuple[str, str] | None:
-    """What of the protocol differs, `game` or a key, and a sentence of it; None where scores mean the same.
-
-    What is asked by the keys of `by` may differ, but for the game.
-
-    Args:
-        configs: by the names of runs or contenders, with dotted keys.
-    """
-    games = {name: title_of(config["env.id"]) for name, config in configs.items()}
-    if len(set(games.values())) > 1:
-        return "game", f"env.id differs: scores of different games are not compared: {_holders(games)}"
-    asked = {resolve(key, config) for key in by for config in configs.values()}
-    for key in PROTOCOL:
-        values = {name: json.dumps(config[key]) for name, config in configs.items()}
-        if key not in asked and len(set(values.values())) > 1:
-            return key, f"{key} differs, so the scores do not mean the same: {_holders(values)}"
-    return None
-
-
-def refuse_mixed_protocols(trainings: Sequence[Training], by: Sequence[str]) -> None:
-    """Raise ConfigError where the scores of trainings do not mean the same, though not because of a key of `by`."""
-    if (mixed := mixed_protocol({training.name: training.config for training in trainings}, by)) is None:
-        return
-    key, sentence = mixed
-    hints = {
-        "game": "choose with runs= or where=env.id=ID",
-        "evaluation.epsilon": (
-            "at_epsilon=VALUE takes evaluations at that one, `evaluate run=NAME epsilon=VALUE` makes them"
-        ),
-    }
-    raise ConfigError(f"{sentence}; {hints.get(key, f'choose with runs= or where=, or ask for it with by={key}')}")
-
-
-def _holders(values: Mapping[str, str]) -> str:
-    """Whose value is which."""
-    names = defaultdict(list)
-    for name, value in values.items():
-        names[value].append(name)
-    return "; ".join(
-        f"{value} in {first}{f' and {len(others)} more' if others else ''}"
-        for value, (first, *others) in sorted(names.items())
-    )
-
-
-def plays_alike(player: Player, trainings: Iterable[Training]) -> bool:
-    """Whether the game of all is the same; a crop belongs to a network, and a player without one has no epsilon."""
-    keys = set(PROTOCOL) - {"env.crop"}
-    if "weights" not in player.config:
-        keys -= {"evaluation.epsilon"}
-    return all(player.config.get(key) == training.config[key] for training in trainings for key in keys)
-
-
-def _check_key(option: str, key: str, trainings: Sequence[Training]) -> None:
-    if trainings and not any(resolve(key, training.facts) for training in trainings):
-        raise ConfigError(f"{option}={key}: no such key; {nearest(key, {k for run in trainings for k in run.facts})}")
-
-
-def _is(value: Any, text: str) -> bool:
-    """Whether a person may write a value so: as Python or YAML print it, a number in any way."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        with suppress(ValueError):
-            return float(text) == value
-    if isinstance(value, list):
-        return "".join(text.split()) in (str(value).replace(" ", ""), json.dumps(value, separators=(",", ":")))
-    return text in (str(value), json.dumps(value))
-
-
-def _config(folder: RunFolder, put_aside: bool) -> dict[str, Any]:
-    """The config of a folder that holds a finished run of ours."""
-    if "~" in folder.name and not put_aside:
-        raise _Unusable("put aside by resume=never")
-    if not folder.has_started:
-        raise _Unusable("foreign: it has no config.json")
-    tree = folder.config
-    if not any(key in tree for key in ("model", *_PLAYERS)):
-        raise _Unusable("foreign: its config.json is not one of ours")
-    if folder.result is None:
-        raise _Unusable("unfinished: the command that started it continues it")
-    return tree
-
-
-def is_of_another(evaluation: RunFolder, run: RunFolder) -> bool:
-    """Whether an evaluation is older than a run: of one of the same name, which `resume=never` put aside."""
-    made, begun = evaluation.commit, run.commit
-    return made is not None and begun is not None and made.updated < begun.started
-
-
-def _training(
-    folder: RunFolder,
-    config: Config,
-    evaluations: Sequence[_Later],
-    epsilon: float | None,
-) -> Training:
-    points = np.array([[record.values[key] for key in _CURVE.values()] for record in curve(folder.path, _POINT)])
-    arrays = dict(zip(_CURVE, points.T, strict=True)) if len(points) else {}
-    tags = read_tags(folder.path)
-    if (updates := arrays.pop("updates", None)) is not None and "flops_per_update" in tags:
-        arrays["flops"] = updates * float(tags["flops_per_update"])
-
-    if (result := folder.ended(config.budget.steps)) is None:
-        raise _Unusable("unfinished: it was made longer; the command that did so continues it")
-    steps = result.steps
-    tables = [(config.evaluation.epsilon, folder, folder.artifact(evaluation_at(steps)))]
-    tables += [
-        (later.epsilon, later.folder, later.folder.artifact(EVALUATION))
-        for later in evaluations
-        if later.step == steps and not is_of_another(later.folder, folder)
-    ]
-    tables = [table for table in tables if table[2].exists() and epsilon in (None, table[0])]
-    if not tables:
-        wanted = "" if epsilon is None else f" at epsilon {epsilon}"
-        raise _Unusable(f"no evaluation{wanted} after its last step: evaluate run={folder.name} makes one")
-    taken, player, path = tables[-1]
-    policy = (tags if player == folder else read_tags(player.path)).get("policy", "")
-    science = config.science()
-    science["phase"] = {str(index): phase for index, phase in enumerate(science["phase"])}
-    budget = config.budget.steps if result.outcome == "budget" else None
-    leaves = flatten(to_dict(config)) | {"evaluation.epsilon": taken, "budget.steps": budget}
-    episodes = _episodes(path, facts_of(config.env.game))
-    is_filmed = player != folder or tags.get("best_evaluation", "").endswith(f" at step {steps}")
-    film = player.artifact(BEST_EPISODE) if is_filmed else None
-    return Training(folder.name, leaves, flatten(science), arrays, episodes, tags, policy, film)
-
-
-def _player(folder: RunFolder, tree: dict[str, Any]) -> Player:
-    return Player(folder.name, flatten(tree), _episodes(folder.artifact(EVALUATION)), folder.artifact(BEST_EPISODE))
-
-
-def _evaluations(outputs: Path, skipped: dict[str, str]) -> tuple[dict[str, list[_Later]], list[Player]]:
-    """The finished runs of the verb `evaluate` by the run that they evaluate, in the order they were made, and exported
-    weights, at each epsilon by the latest of theirs."""
-    found: dict[str, list[_Later]] = defaultdict(list)
-    exported: dict[tuple[str, float], list[tuple[int, str, Player]]] = defaultdict(list)
-    for path in sorted((outputs / "evaluations").glob(f"*/{RESULT}")):
-        folder = RunFolder(path.parent)
-        try:
-            facts, commit = folder.config, folder.commit
-            if commit is None:
-                continue
-            if not isfinite(epsilon := float(facts["evaluation"]["epsilon"])):
-                raise ValueError("its epsilon is no number")
-            if "run" in facts:
-                found[str(facts["run"])].append(_Later(commit.updated, int(facts["step"]), epsilon, folder))
-            elif "weights" in facts:
-                player = _player(folder, facts)
-                exported[str(facts["sha256"]), epsilon].append((commit.updated, folder.name, player))
-        except (Fault, ValueError, KeyError, TypeError, OverflowError, OSError) as error:
-            skipped[f"evaluations/{folder.name}"] = f"broken: {type(error).__name__}: {error}"
-    trainings = {run: sorted(later, key=lambda each: each.made) for run, later in found.items()}
-    return trainings, [max(made)[-1] for made in exported.values()]
-
-
-def _episodes(path: Path, game: Game | None = None) -> EpisodeTable:
-    """A table of episodes, and of its points those of a game's sources. Raises: ValueError, OSError."""
-    episodes = EpisodeTable.read(path, game.sources if game else ())
-    if not np.isfinite(episodes.scores).all():
-        raise ValueError(f"{path} has a score that is no finite number")
-    others = (episodes.steps, episodes.frames, episodes.truncated, episodes.counts)
-    if not all(np.isfinite(each).all() for each in others):
-        raise ValueError(f"{path} has a count that is no finite number")
-    if game and game.actions and episodes.actions != game.actions:
-        raise ValueError(f"{path} has other actions than the game")
-    return episodes

@@ -1,22 +1,20 @@
-"""What a reader must know before believing a comparison: one small function a matter, each with its lines or none."""
+"""Say what a reader must know before believing a comparison: a function a subject, which yields its lines or none."""
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import isclose, nan
 from statistics import fmean
-from typing import TypeVar
 
+from atlantis_exp.comparison.choosing import COMMIT, resolve, values_in
 from atlantis_exp.comparison.decision import FEWEST_SEEDS, equal_scores
-from atlantis_exp.comparison.gather import AXES, COMMIT, Training, resolve
+from atlantis_exp.comparison.gather import AXES, StoredRun, Training
 from atlantis_exp.comparison.published import Table, early_dqn, random_line
 from atlantis_exp.comparison.verdict import Answer
 from atlantis_exp.components import Component, facts_of
 from atlantis_exp.runs.folder import LOST
 from atlantis_exp.terminal import PROGRAM
-
-T = TypeVar("T")
 
 _NAMED = 6  # runs, up to which a line names them
 
@@ -27,6 +25,7 @@ class Facts:
 
     game: Component | None
     groups: Mapping[str, Sequence[Training]]
+    lost: Sequence[StoredRun]  # runs that should have been in the groups
     by: Sequence[str]
     answers: Sequence[Answer]
     tables: Mapping[str, Table]
@@ -38,8 +37,11 @@ class Facts:
         return [training for runs in self.groups.values() for training in runs]
 
 
+Note = Callable[[Facts], Iterator[str]]
+
+
 def collapsed(facts: Facts) -> Iterator[str]:
-    """Policies of one action."""
+    """Name policies of one action."""
     for label, runs in facts.groups.items():
         if names := [run.name for run in runs if run.has_collapsed]:
             yield (
@@ -48,8 +50,22 @@ def collapsed(facts: Facts) -> Iterator[str]:
             )
 
 
+def lost_seeds(facts: Facts) -> Iterator[str]:
+    """Name seeds of a group whose runs are unfinished, failed or damaged."""
+    names = defaultdict(list)
+    for run in facts.lost:
+        label = " ".join(values_in(run.facts, facts.by)) or "all"
+        if run.config["seed"] not in {there.config["seed"] for there in facts.groups.get(label, ())}:
+            names[label].append(run.name)
+    for label, missing in names.items():
+        yield (
+            f"{label} lacks {len(missing)} {'seed' if len(missing) == 1 else 'seeds'}, unfinished or unusable: "
+            f"{_listed(missing)}. If how it played is the reason, the others do not stand for it."
+        )
+
+
 def equal(facts: Facts) -> Iterator[str]:
-    """Equal lists of scores, which count like others."""
+    """Name equal lists of scores, which count like others."""
     label_of = {run.name: label for label, runs in facts.groups.items() for run in runs}
     alike = defaultdict(list)
     for names in equal_scores({run.name: run.episodes.scores.tolist() for run in facts.trainings}):
@@ -60,7 +76,7 @@ def equal(facts: Facts) -> Iterator[str]:
 
 
 def modes_found(facts: Facts) -> Iterator[str]:
-    """Seeds that fall into two modes."""
+    """Describe seeds that fall into two modes."""
     for row in facts.tables["modes"]:
         yield (
             f"{row['group']} falls into two modes: {row['upper_share']:.0%} of its seeds score "
@@ -69,56 +85,54 @@ def modes_found(facts: Facts) -> Iterator[str]:
         )
 
 
-def different_makers(facts: Facts) -> Iterator[str]:
-    """Precisions, devices and processors, which do not enter a run's identity."""
-    for tag, how in (
-        ("precision", "in different precisions"),
-        ("device", "on different devices"),
-        ("processor", "on different processors, so that equal hours are not equal work"),
-    ):
-        holders = _holders((run.tags[tag], run.name) for run in facts.trainings if tag in run.tags)
+def unlike(facts: Facts) -> Iterator[str]:
+    """Name differences between runs that their identity leaves out; a tag that some lack may differ there."""
+    runs = facts.trainings
+    subjects: dict[str, Callable[[Training], str]] = {
+        "made in different precisions": lambda run: run.tags.get("precision", "not recorded"),
+        "made on different devices": lambda run: run.tags.get("device", "not recorded"),
+        "made on different processors, so that equal hours are not equal work": (
+            lambda run: run.tags.get("processor", "not recorded")
+        ),
+        "evaluated by different numbers of episodes, each by its latest evaluation": (
+            lambda run: f"{run.episodes.scores.size:,}"
+        ),
+    }
+    if "budget.steps" not in facts.by:
+        subjects["not trained equally long"] = lambda run: (
+            f"budget.steps={most:,}" if (most := run.config["budget.steps"]) else "the whole plan"
+        )
+    for how, value in subjects.items():
+        holders = defaultdict(list)
+        for run in runs:
+            holders[value(run)].append(run.name)
         if len(holders) > 1:
             named = "; ".join(f"{value}: {_listed(names)}" for value, names in sorted(holders.items()))
-            yield f"The runs were made {how}: {named}."
-
-
-def different_lengths(facts: Facts) -> Iterator[str]:
-    """Budgets that ended trainings, which do not enter a run's identity either."""
-    budgets = ((run.config["budget.steps"], run.name) for run in facts.trainings)
-    holders = _holders(("the whole plan" if most is None else f"budget.steps={most:,}", name) for most, name in budgets)
-    if len(holders) > 1 and "budget.steps" not in facts.by:
-        named = "; ".join(f"{length}: {_listed(names)}" for length, names in holders.items())
-        yield f"The runs were not trained equally long: {named}."
-
-
-def different_evaluations(facts: Facts) -> Iterator[str]:
-    """Evaluations of unequal size, as a single later episode of one run."""
-    holders = _holders((run.episodes.scores.size, run.name) for run in facts.trainings)
-    if len(holders) > 1:
-        named = "; ".join(f"{size:,}: {_listed(names)}" for size, names in sorted(holders.items()))
-        yield f"The runs were evaluated by different numbers of episodes, each by its latest evaluation: {named}."
+            yield f"The runs were {how}: {named}."
 
 
 def lossy(facts: Facts) -> Iterator[str]:
-    """Runs that went on without a part of their replay memory."""
+    """Name runs that went on without a part of their replay memory."""
     if names := [run.name for run in facts.trainings if LOST in run.tags]:
         yield f"Went on without a part of their replay memory, which was damaged: {_listed(names)}."
 
 
 def uncommitted(facts: Facts) -> Iterator[str]:
-    """Runs of code that no commit holds, where commits are compared."""
+    """Name runs of code that no commit holds, if commits are compared."""
     names = [run.name for run in facts.trainings if run.tags.get("git.dirty") == "true"]
     if COMMIT in facts.by and names:
         yield f"Made with changes that their commit does not hold: {_listed(names)}."
 
 
 def unbalanced(facts: Facts) -> Iterator[str]:
-    """Groups that a key's values cannot be averaged over, and keys that are not answered by themselves."""
+    """Name groups that a key's values cannot be averaged over, and keys that are not answered by themselves."""
     for answer in facts.answers:
         family = answer.family
         if family.left_out:
-            left_out = _listed(family.left_out)
-            yield f"By {family.name}, some groups do not count, for not all values have their like: {left_out}."
+            yield (
+                f"By {family.name}, groups without a counterpart for every value are left out: "
+                f"{_listed(family.left_out)}."
+            )
         for value, members in family.groups.items():
             if members and (alone := set.union(*(set(group.seeds) for group in members)) - family.seeds[value].keys()):
                 yield (
@@ -132,7 +146,7 @@ def unbalanced(facts: Facts) -> Iterator[str]:
 
 
 def later_seeds(facts: Facts) -> Iterator[str]:
-    """Seeds that came after the look that a verdict rests on."""
+    """Name groups with more seeds than the look that a verdict rests on."""
     late: dict[str, int] = {}
     for answer in facts.answers:
         counts = {value: len(seeds) for value, seeds in answer.family.seeds.items()}
@@ -148,7 +162,7 @@ def later_seeds(facts: Facts) -> Iterator[str]:
 
 
 def moved_seeds(facts: Facts) -> Iterator[str]:
-    """Seeds of a look that are gone, or have other scores now."""
+    """Name pairs whose seeds at a look are gone, or have other scores now."""
     for answer in facts.answers:
         stands: dict[str, bool] = {}
         for look in answer.decision.looks:
@@ -162,13 +176,13 @@ def moved_seeds(facts: Facts) -> Iterator[str]:
                 stands[pair] = isclose(now, verdict.difference, abs_tol=1e-6)
         if moved := [pair for pair, is_so in stands.items() if not is_so]:
             yield (
-                f"By {answer.family.name}, runs of past looks are gone or have other scores now, and what was said "
-                f"stays: {_listed(moved)}."
+                f"By {answer.family.name}, runs of past looks are gone or have other scores now, and their verdicts "
+                f"stay: {_listed(moved)}."
             )
 
 
 def unplanned(facts: Facts) -> Iterator[str]:
-    """Looks at other numbers of seeds than the planned ones."""
+    """Name looks at other numbers of seeds than planned."""
     for answer in facts.answers:
         before, planned = 0, answer.family.plan.looks
         for look in answer.decision.looks:
@@ -183,8 +197,25 @@ def unplanned(facts: Facts) -> Iterator[str]:
             before = look.size
 
 
+def in_training(facts: Facts) -> Iterator[str]:
+    """Name the group that leads in each view, if the intervals of its differences leave out zero."""
+    outcomes: dict[str, list[str]] = defaultdict(list)
+    views = facts.tables["views"]
+    for view in dict.fromkeys(row["view"] for row in views):
+        rows = [row for row in views if row["view"] == view]
+        if all(row["low"] > 0 for row in rows):
+            outcomes[f"{rows[0]['leader']} leads at {{}}"].append(view)
+        elif any(row["low"] <= 0 for row in rows):
+            outcomes["no lead is clear at {}, where an interval includes zero"].append(view)
+        else:
+            outcomes["nothing can be said of {}, for want of seeds"].append(view)
+    if outcomes:
+        said = "; ".join(text.format(" and ".join(at)) for text, at in outcomes.items())
+        yield f"In training, {said}: descriptions, not verdicts."
+
+
 def few_seeds(facts: Facts) -> Iterator[str]:
-    """Groups that can decide nothing."""
+    """Name groups that have too few seeds for a look."""
     for label, runs in facts.groups.items():
         seeds = len({run.config["seed"] for run in runs})
         if seeds < FEWEST_SEEDS:
@@ -192,7 +223,7 @@ def few_seeds(facts: Facts) -> Iterator[str]:
 
 
 def mixed(facts: Facts) -> Iterator[str]:
-    """Differences within a group, and between groups beyond the question."""
+    """Name differences within a group, and between groups beyond the question."""
     varied = {label: _differing([run.science for run in runs]) for label, runs in facts.groups.items()}
     for label, keys in varied.items():
         if keys := {key: values for key, values in keys.items() if key != "seed"}:
@@ -210,14 +241,14 @@ def mixed(facts: Facts) -> Iterator[str]:
 
 
 def begun(facts: Facts) -> Iterator[str]:
-    """Trainings before those that are compared."""
+    """Name the weights that trainings began with."""
     for label, runs in facts.groups.items():
         if weights := dict.fromkeys(str(run.config[key]) for run in runs if run.config.get(key := "training.weights")):
             yield f"{label} began with {_listed([*weights])}; what that took counts in no frames, hours or arithmetic."
 
 
 def survival_and_rate(facts: Facts) -> Iterator[str]:
-    """Which part of the difference between two means is survival, and which is rate."""
+    """Split the difference between two means into survival and rate."""
     if len(facts.tables["why"]) != 2:
         return
     one, other = facts.tables["why"]
@@ -230,12 +261,12 @@ def survival_and_rate(facts: Facts) -> Iterator[str]:
         f"The mean of {one['group']} less that of {other['group']} is {one['mean'] - other['mean']:+,.0f} points: "
         f"{survival:+,.0f} by survival ({frames:,.0f} against {other_frames:,.0f} frames an episode) and "
         f"{pace:+,.0f} by rate ({rate:,.0f} against {other_rate:,.0f} points per 1,000 frames). This describes the "
-        f"episodes; nothing is decided by it."
+        f"episodes; it is not a verdict."
     )
 
 
 def missing_views(facts: Facts) -> Iterator[str]:
-    """Views of the training that cannot be had."""
+    """Name views of the training that cannot be had."""
     shown = {row["view"] for row in facts.tables["views"]}
     missing = [name for name in AXES.values() if len(facts.groups) > 1 and name not in shown]
     if missing:
@@ -243,7 +274,7 @@ def missing_views(facts: Facts) -> Iterator[str]:
 
 
 def capped(facts: Facts) -> Iterator[str]:
-    """Scores that the time cap decides."""
+    """Name groups whose scores the time cap decides."""
     if shares := [
         f"{row['time_cap_share']:.0%} of {row['group']}" for row in facts.tables["evaluation"] if row["time_cap_share"]
     ]:
@@ -254,62 +285,38 @@ def capped(facts: Facts) -> Iterator[str]:
 
 
 def measured_players(facts: Facts) -> Iterator[str]:
-    """What was not trained here and played the same game."""
+    """Name players of the same game that were not trained here."""
     if players := [row for row in facts.tables["references"] if row["name"].endswith(", measured")]:
         scores = [f"{row['name'].removesuffix(', measured')} {row['score']:,.0f}" for row in players]
         yield f"In the same game, on average: {', '.join(scores)}."
 
 
-def other_players(facts: Facts) -> Iterator[str]:
-    """What the random player's line is worth."""
-    if (random_player := random_line(facts.tables["references"])) is None:
+def random_player(facts: Facts) -> Iterator[str]:
+    """Say where the random player's score is from, and why early scores below it are normal."""
+    if (random := random_line(facts.tables["references"])) is None:
         return
-    if random_player["protocol"].startswith("published"):
+    if random["protocol"].startswith("published"):
         yield (
             "No random player was measured under these settings, so a published one takes its place; "
             f"{PROGRAM} baseline with the same env measures one."
         )
-    scores = [row["mean"] for row in facts.tables["evaluation"]]  # as the player's
     is_early = facts.frames <= facts_of(facts.game).early_frames
-    if is_early and any(score < random_player["score"] for score in scores) and (why := early_dqn(facts.game)):
+    is_below = any(row["mean"] < random["score"] for row in facts.tables["evaluation"])
+    if is_early and is_below and (why := early_dqn(facts.game)):
         yield why
 
 
-CAVEATS: Sequence[Callable[[Facts], Iterator[str]]] = (
-    collapsed,
-    equal,
-    modes_found,
-    different_makers,
-    different_lengths,
-    different_evaluations,
-    lossy,
-    uncommitted,
-    unbalanced,
-    later_seeds,
-    moved_seeds,
-    unplanned,
+CAVEATS: Sequence[Note] = (
+    *(collapsed, lost_seeds, equal, modes_found, unlike, lossy, uncommitted),
+    *(unbalanced, later_seeds, moved_seeds, unplanned),
 )
-"""What can make a verdict mean something else."""
+"""What may make a verdict mean something else."""
 
-NOTES: Sequence[Callable[[Facts], Iterator[str]]] = (
-    few_seeds,
-    mixed,
-    begun,
-    survival_and_rate,
-    missing_views,
-    capped,
-    measured_players,
-    other_players,
+NOTES: Sequence[Note] = (
+    *(in_training, few_seeds, mixed, begun, survival_and_rate),
+    *(missing_views, capped, measured_players, random_player),
 )
 """What is said after it."""
-
-
-def _holders(values: Iterable[tuple[T, str]]) -> dict[T, list[str]]:
-    """Whose value is which: from pairs of a value and a run's name."""
-    holders = defaultdict(list)
-    for value, name in values:
-        holders[value].append(name)
-    return holders
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -322,7 +329,7 @@ def _values(keys: Mapping[str, Sequence[str]]) -> str:
 
 
 def _differing(configs: Sequence[Mapping[str, object]]) -> dict[str, list[str]]:
-    """The keys in which configs differ, with their values."""
+    """Return the keys in which configs differ, with their values."""
     keys = dict.fromkeys(key for config in configs for key in config)
     values = {key: list(dict.fromkeys(json.dumps(config.get(key)) for config in configs)) for key in keys}
     return {key: found for key, found in values.items() if len(found) > 1}

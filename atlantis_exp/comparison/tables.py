@@ -1,15 +1,16 @@
-"""Runs to tables and answers: every number that a figure or the page shows is in one of the tables."""
+"""Compute the tables and answers of a comparison: every number on the page or in a figure is in one of the tables."""
 
 import csv
 import io
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from math import isnan
 
 import numpy as np
 
+from atlantis_exp.comparison.choosing import plays_alike
 from atlantis_exp.comparison.decision import (
     FEWEST_SEEDS,
     Look,
@@ -20,13 +21,13 @@ from atlantis_exp.comparison.decision import (
     mean_interval,
     modes,
 )
-from atlantis_exp.comparison.gather import AXES, Array, Gathered, Player, Training, plays_alike
+from atlantis_exp.comparison.gather import AXES, Array, Gathered, Player, Training
 from atlantis_exp.comparison.notes import CAVEATS, NOTES, Facts
 from atlantis_exp.comparison.published import Row, Table, curves, scores
-from atlantis_exp.comparison.verdict import Answer, Question, answer, families, group_of
+from atlantis_exp.comparison.verdict import Answer, Question, answer, families, group_of, one_a_seed
 from atlantis_exp.comparison.words import said
 from atlantis_exp.components import facts_of, title_of
-from atlantis_exp.registry import Game
+from atlantis_exp.games import Game
 from atlantis_exp.statistics import Scores, human_normalised, probability_of_improvement, summarize
 
 Groups = Mapping[str, Sequence[Training]]
@@ -37,7 +38,7 @@ _NAN = float("nan")
 
 @dataclass(frozen=True)
 class Comparison:
-    """All that is known about some groups of runs."""
+    """A comparison of groups of runs, as it is printed and drawn."""
 
     title: str  # of the game
     game: Game
@@ -45,8 +46,8 @@ class Comparison:
     by: list[str]
     answers: list[Answer]
     verdict: str  # the answer by the first key
-    others: list[str]  # the answers to the rest of the question
-    caveats: list[str]  # what can make a verdict mean something else
+    others: list[str]  # the answers by the other keys
+    caveats: list[str]  # what may make the verdict mean something else
     notes: list[str]
     tables: dict[str, Table]
 
@@ -64,15 +65,14 @@ def compare(
         record: the looks taken before, by family.
 
     Raises:
-        ConfigError: for a baseline that is none of what is compared.
+        ConfigError: if the baseline is not among what is compared.
     """
     seeds_of = [group_of(runs, question.by) for runs in groups.values()]
     answers = answer(families(seeds_of, question), record or {}, now)
     trainings = [training for runs in groups.values() for training in runs]
     component = trainings[0].game
     game = facts_of(component)
-    players = [player for player in gathered.players if plays_alike(player, trainings)]
-    frames = max((training.curve["frames"][-1] for training in trainings if training.curve), default=0.0)
+    frames = max((float(training.curve["frames"][-1]) for training in trainings if training.curve), default=0.0)
     by_label = {group.label: group.seeds for group in seeds_of}
     named: list[tuple[str, dict[str, dict[int, float]], Answer | None]] = [
         (each.family.name, each.family.seeds, each) for each in answers
@@ -86,7 +86,7 @@ def compare(
             for value, seeds in values.items()
             for seed, score in seeds.items()
         ],
-        "verdict": [row for each in answers for row in _verdicts(each)],
+        "verdict": [{"family": each.family.name, **_verdict(of)} for each in answers for of in each.decision.verdicts],
         "plan": [_plan(each) for each in answers],
         "looks": [row for each in answers for row in _looks(each)],
         "evaluation": evaluation,
@@ -102,23 +102,24 @@ def compare(
         "profile": _profile(groups, game),
         "actions": [row for label, runs in groups.items() for row in _actions(label, runs)],
         "episodes": [row for label, runs in groups.items() for training in runs for row in _episodes(label, training)],
-        "references": [_measured(player) for player in players] + scores(component),
+        "references": [
+            *(_measured(player) for player in gathered.players if plays_alike(player, trainings)),
+            *scores(component),
+        ],
         "published_curves": [row for row in curves(component) if row["frames"] <= frames],
         "skipped": [{"run": name, "reason": reason} for name, reason in gathered.skipped.items()],
     }
-    facts = Facts(component, groups, question.by, answers, tables, float(frames))
-    caveats, notes = ([line for note in notes for line in note(facts)] for notes in (CAVEATS, NOTES))
+    facts = Facts(component, groups, gathered.lost, question.by, answers, tables, frames)
+    caveats, notes = ([line for note in each for line in note(facts)] for each in (CAVEATS, NOTES))
     if now and answers and all(each.taken is None for each in answers):
-        caveats.append("look=now took no look: no group that is undecided has new seeds, or one has fewer than five.")
-    if training := _in_training(tables["views"]):
-        notes.insert(0, training)
+        caveats.append("look=now took no look: no undecided group has new seeds, or one has fewer than five.")
     verdict, *others = _sentences(answers, list(groups))
     title = title_of(trainings[0].config["env.id"])
     return Comparison(title, game, list(groups), list(question.by), answers, verdict, others, caveats, notes, tables)
 
 
 def to_csv(table: Table) -> str:
-    """A table with its keys as header; empty for an empty table."""
+    """Write a table with its keys as header; an empty one is an empty text."""
     text = io.StringIO()
     if table:
         writer = csv.DictWriter(text, table[0].keys(), lineterminator="\n")
@@ -128,7 +129,6 @@ def to_csv(table: Table) -> str:
 
 
 def _sentences(answers: Sequence[Answer], groups: Sequence[str]) -> list[str]:
-    """The answer of each family."""
     if not answers:
         return [f"There is one group only ({groups[0]}), so there is nothing to compare; by=KEY splits it."]
     if len(answers) == 1:
@@ -137,12 +137,11 @@ def _sentences(answers: Sequence[Answer], groups: Sequence[str]) -> list[str]:
 
 
 def _scores(family: str, values: Mapping[str, Mapping[int, float]], answer: Answer | None) -> Table:
-    """The score of each value of a family, and the difference to the baseline where it has one."""
+    """Return the score of each value of a family, with the difference to the baseline if there is one."""
     baseline = answer.family.plan.baseline if answer else None
     found = {verdict.group: verdict for verdict in answer.decision.verdicts} if answer and baseline else {}
     table = []
     for value, seeds in values.items():
-        score = float(np.mean(list(seeds.values()))) if seeds else _NAN
         low, high = _mean_interval(list(seeds.values()))
         verdict = found.get(value, Verdict(value, baseline or ""))
         table.append(
@@ -150,7 +149,7 @@ def _scores(family: str, values: Mapping[str, Mapping[int, float]], answer: Answ
                 "family": family,
                 "group": value,
                 "seeds": len(seeds),
-                "score": score,
+                "score": float(np.mean(list(seeds.values()))) if seeds else _NAN,
                 "low": low,
                 "high": high,
                 "baseline": baseline or "",
@@ -164,12 +163,8 @@ def _scores(family: str, values: Mapping[str, Mapping[int, float]], answer: Answ
 
 
 def _mean_interval(seeds: Sequence[float] | Array) -> tuple[float, float]:
-    """Student's interval from `FEWEST_SEEDS` on; of fewer seeds no interval is to be trusted, so NaN."""
+    """Return Student's interval; NaN for fewer than `FEWEST_SEEDS` seeds, for which it cannot be trusted."""
     return mean_interval(seeds) if len(seeds) >= FEWEST_SEEDS else (_NAN, _NAN)
-
-
-def _verdicts(answer: Answer) -> Table:
-    return [{"family": answer.family.name, **_verdict(verdict)} for verdict in answer.decision.verdicts]
 
 
 def _verdict(verdict: Verdict) -> Row:
@@ -198,7 +193,6 @@ def _plan(answer: Answer) -> Row:
 
 
 def _looks(answer: Answer) -> Table:
-    """The intervals as they shrank: one row a look and pair."""
     return [
         {"family": answer.family.name, "look": index, "spent": look.error, **_verdict(verdict)}
         for index, look in enumerate(answer.decision.looks, 1)
@@ -206,15 +200,14 @@ def _looks(answer: Answer) -> Table:
     ]
 
 
-def _pooled(runs: Sequence[Training]) -> Scores:
-    return np.concatenate([training.episodes.scores for training in runs])
+def _pooled(runs: Sequence[Training], column: str = "scores") -> Scores:
+    """Return a column of all episodes of some runs."""
+    return np.concatenate([getattr(training.episodes, column) for training in runs])
 
 
 def _evaluation(label: str, runs: Sequence[Training], game: Game) -> Row:
-    """What the episodes of a group are like."""
-    summary = summarize(_pooled(runs))
-    frames = np.concatenate([training.episodes.frames for training in runs])
-    truncated = np.concatenate([training.episodes.truncated for training in runs])
+    """Describe the episodes of a group."""
+    summary, frames = summarize(_pooled(runs)), _pooled(runs, "frames").sum()
     normalised = human_normalised(summary.mean, game.random_score, game.human_score)
     return {
         "group": label,
@@ -224,37 +217,32 @@ def _evaluation(label: str, runs: Sequence[Training], game: Game) -> Row:
         "median": summary.median,
         "low": summary.low,
         "high": summary.high,
-        "points_per_frame": float(_pooled(runs).sum() / frames.sum()) if frames.sum() else _NAN,
-        "time_cap_share": float(truncated.mean()),
+        "points_per_frame": float(_pooled(runs).sum() / frames) if frames else _NAN,
+        "time_cap_share": float(_pooled(runs, "truncated").mean()),
         **({} if isnan(normalised) else {"human_normalised_mean": normalised}),
     }
 
 
 def _why(label: str, runs: Sequence[Training], sources: Sequence[str]) -> Row:
-    """A group's mean score as mean frames an episode times rate, and what the rate is made of.
+    """Split a group's mean score into mean frames an episode times rate, and the rate into its sources.
 
-    The rate is in points per 1,000 emulator frames, and its parts sum to it; they are NaN where an episode's are.
+    The rate is in points per 1,000 emulator frames. The parts sum to it; they are NaN if an episode lacks them.
     """
-    tables = [training.episodes for training in runs]
-    scores, frames, truncated, points = (
-        np.concatenate([getattr(table, name) for table in tables])
-        for name in ("scores", "frames", "truncated", "points")
-    )
+    frames = _pooled(runs, "frames")
     thousands = frames.sum() / 1_000 or _NAN
     return {
         "group": label,
-        "mean": float(scores.mean()),
+        "mean": float(_pooled(runs).mean()),
         "frames_mean": float(frames.mean()),
-        "time_cap_share": float(truncated.mean()),
-        "points_per_1000_frames": float(scores.sum() / thousands),
-        **dict(zip(sources, (points.sum(axis=0) / thousands).tolist(), strict=True)),
+        "time_cap_share": float(_pooled(runs, "truncated").mean()),
+        "points_per_1000_frames": float(_pooled(runs).sum() / thousands),
+        **dict(zip(sources, (_pooled(runs, "points").sum(axis=0) / thousands).tolist(), strict=True)),
     }
 
 
 def _modes(evaluation: Row, seeds: Mapping[int, float]) -> Table:
-    """One row where a group's seeds fall into two modes: how many survive, and what those score."""
-    found = modes(list(seeds.values()))
-    if found is None:
+    """Return one row if a group's seeds fall into two modes: the share that survives, and both scores."""
+    if (found := modes(list(seeds.values()))) is None:
         return []
     return [
         {
@@ -275,13 +263,12 @@ def _runs(label: str, runs: Sequence[Training]) -> Table:
     table = []
     for training in runs:
         summary = summarize(training.episodes.scores)
-        last = {axis: training.curve[axis][-1] if axis in training.curve else "" for axis in AXES}
         table.append(
             {
                 "run": training.name,
                 "group": label,
                 "seed": training.config["seed"],
-                **last,
+                **{axis: training.curve[axis][-1] if axis in training.curve else "" for axis in AXES},
                 "epsilon": training.config["evaluation.epsilon"],
                 "episodes": summary.episodes,
                 "score": summary.interquartile_mean,
@@ -308,25 +295,22 @@ def _improvement(groups: Groups) -> Table:
 
 
 def _curve(axis: str, label: str, runs: Sequence[Training]) -> Table:
-    """The mean over seeds as far as all runs go, with its interval where there are seeds enough."""
+    """Return the mean over seeds as far as all runs go, with its interval if there are enough seeds."""
     if (grid := _grid(axis, runs)) is None:
         return []
-    seeds = defaultdict(list)
-    for training in runs:
-        seeds[training.config["seed"]].append(_at(training, axis, grid))
-    scores = np.array([np.mean(same, axis=0) for same in seeds.values()])
-    epsilons = np.mean([_at(training, axis, grid, "epsilon") for training in runs], axis=0)
-    bounds = [_mean_interval(column) for column in scores.T]
+    seeds = np.array([*one_a_seed(runs, partial(_at, axis=axis, x=grid)).values()])
+    epsilons = np.mean([_at(run, axis, grid, "epsilon") for run in runs], axis=0)
+    bounds = [_mean_interval(column) for column in seeds.T]
     return [
         {"axis": axis, "group": label, "x": x, "score": score, "low": low, "high": high, "epsilon": epsilon}
         for x, score, (low, high), epsilon in zip(
-            grid.tolist(), scores.mean(axis=0).tolist(), bounds, epsilons.tolist(), strict=True
+            grid.tolist(), seeds.mean(axis=0).tolist(), bounds, epsilons.tolist(), strict=True
         )
     ]
 
 
 def _seed_curves(axis: str, label: str, runs: Sequence[Training]) -> Table:
-    """The curves of a group's several runs, where they are too few for an interval."""
+    """Return the curves of a group's runs if they are several, and too few for an interval."""
     seeds = {training.config["seed"] for training in runs}
     if len(runs) == 1 or len(seeds) >= FEWEST_SEEDS or (grid := _grid(axis, runs)) is None:
         return []
@@ -338,7 +322,7 @@ def _seed_curves(axis: str, label: str, runs: Sequence[Training]) -> Table:
 
 
 def _grid(axis: str, runs: Sequence[Training]) -> Array | None:
-    """Where all runs have a curve; None where they have none in common."""
+    """Return places at which all runs have a curve; None if they share none."""
     if not all(axis in training.curve for training in runs):
         return None
     first = max(training.curve[axis][0] for training in runs)
@@ -351,7 +335,7 @@ def _at(training: Training, axis: str, x: float | Array, measure: str = "score")
 
 
 def _profile(groups: Groups, game: Game) -> Table:
-    """The share of episodes that score more than tau (Agarwal et al. 2021), for tau over all scores."""
+    """Return the share of episodes that score more than tau (Agarwal et al. 2021), for tau over all scores."""
     scores = np.concatenate([_pooled(runs) for runs in groups.values()])
     if game.is_logarithmic:
         least = game.score_range[0] / 10
@@ -359,28 +343,23 @@ def _profile(groups: Groups, game: Game) -> Table:
     else:
         taus = np.linspace(min(scores.min(), 0.0), max(scores.max(), 1.0), _GRID)
     return [
-        {"group": label, "tau": tau, "share": share}
+        {"group": label, "tau": tau, "share": float((_pooled(runs) > tau).mean())}
         for label, runs in groups.items()
-        for tau, share in zip(taus.tolist(), _shares(_pooled(runs), taus).tolist(), strict=True)
+        for tau in taus.tolist()
     ]
 
 
-def _shares(scores: Scores, taus: Scores) -> Scores:
-    return np.asarray(1 - np.searchsorted(np.sort(scores), taus, "right") / scores.size, np.float64)
-
-
 def _actions(label: str, runs: Sequence[Training]) -> Table:
-    counts = sum(training.episodes.counts.sum(axis=0) for training in runs)
-    shares = np.asarray(counts) / np.sum(counts)
+    counts = _pooled(runs, "counts").sum(axis=0)
     return [
         {"group": label, "action": action, "network": float(network), "random": float(chance)}
-        for action, (network, chance) in zip(runs[0].episodes.actions, shares, strict=True)
+        for action, (network, chance) in zip(runs[0].episodes.actions, counts / counts.sum(), strict=True)
     ]
 
 
 def _episodes(label: str, training: Training) -> Table:
-    episodes = training.episodes
-    rows = zip(episodes.scores.tolist(), episodes.steps.tolist(), episodes.truncated.tolist(), strict=True)
+    table = training.episodes
+    rows = zip(table.scores.tolist(), table.steps.tolist(), table.truncated.tolist(), strict=True)
     return [
         {
             "run": training.name,
@@ -388,9 +367,9 @@ def _episodes(label: str, training: Training) -> Table:
             "episode": index,
             "score": score,
             "steps": int(steps),
-            "truncated": int(cut),
+            "truncated": int(truncated),
         }
-        for index, (score, steps, cut) in enumerate(rows)
+        for index, (score, steps, truncated) in enumerate(rows)
     ]
 
 
@@ -407,9 +386,9 @@ def _measured(player: Player) -> Row:
 
 
 def _views(groups: Groups) -> Table:
-    """The leader in each of the three fair views against each other group, where the shortest run ends.
+    """Compare the leader in each of the three fair views with each other group, where the shortest run ends.
 
-    Descriptions: no look is spent on them. The intervals are those of one look at all pairs, whoever leads.
+    No look is spent on these descriptions. The intervals are those of one look at all pairs, whichever group leads.
     """
     table: Table = []
     trainings = [training for runs in groups.values() for training in runs]
@@ -417,7 +396,8 @@ def _views(groups: Groups) -> Table:
         if (grid := _grid(axis, trainings)) is None:
             continue
         shortest = float(grid[-1])
-        values = {label: _one_a_seed(runs, axis, shortest) for label, runs in groups.items()}
+        at_end = partial(_at, axis=axis, x=shortest)
+        values = {label: one_a_seed(runs, at_end) for label, runs in groups.items()}
         means = {label: float(np.mean(list(seeds.values()))) for label, seeds in values.items()}
         intervals = _at_once(values)
         leader, *others = sorted(means, key=lambda label: -means[label])
@@ -439,17 +419,11 @@ def _views(groups: Groups) -> Table:
     return table
 
 
-def _one_a_seed(runs: Sequence[Training], axis: str, x: float) -> dict[int, float]:
-    values = defaultdict(list)
-    for training in runs:
-        values[int(training.config["seed"])].append(float(_at(training, axis, x)))
-    return {seed: float(np.mean(found)) for seed, found in values.items()}
-
-
 def _at_once(values: Mapping[str, Mapping[int, float]]) -> dict[tuple[str, str], tuple[float, float]]:
-    """Intervals of all differences, as of one look with an error of 5 %; none of fewer than `FEWEST_SEEDS` seeds.
+    """Return intervals of all differences, as one look with an error of 5 % gives them.
 
-    Of groups with unequal numbers of seeds there are none either, since they would not be of the difference shown.
+    There are none for fewer than `FEWEST_SEEDS` seeds. Neither are there for unequal numbers of seeds, since they would
+    not be intervals of the differences shown.
     """
     sizes = {len(seeds) for seeds in values.values()}
     if len(sizes) > 1 or min(sizes) < FEWEST_SEEDS:
@@ -457,15 +431,3 @@ def _at_once(values: Mapping[str, Mapping[int, float]]) -> dict[tuple[str, str],
     verdicts = decide(values, Plan(looks=(min(sizes),))).verdicts
     intervals = {(verdict.group, verdict.other): (verdict.low, verdict.high) for verdict in verdicts}
     return intervals | {(other, group): (-high, -low) for (group, other), (low, high) in intervals.items()}
-
-
-def _in_training(views: Table) -> str:
-    """Who leads in the fair views."""
-    sides: dict[str, list[str]] = defaultdict(list)
-    for view in views:
-        if view["difference"] and view["view"] not in sides[view["leader"]]:
-            sides[view["leader"]].append(view["view"])
-    if not any(sides.values()):
-        return ""
-    leads = "; ".join(f"{label} leads at {' and '.join(at)}" for label, at in sides.items() if at)
-    return f"In training {leads}: a description, which nothing is decided by."

@@ -6,15 +6,17 @@ the looks that are due, and `wanted` says which seeds the next looks need.
 """
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count, islice
+from typing import Any
 
 import numpy as np
 
 from atlantis_exp.checking import nearest
+from atlantis_exp.comparison.choosing import COMMIT, values_in
 from atlantis_exp.comparison.decision import Decision, Look, Plan, decide, looks_up_to
-from atlantis_exp.comparison.gather import COMMIT, Training, values_of
+from atlantis_exp.comparison.gather import Training
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.statistics import interquartile_mean
 
@@ -66,21 +68,22 @@ class Answer:
     taken: Look | None  # just now
 
 
-def scored(training: Training) -> float:
-    """The score of a seed: the interquartile mean of its evaluated episodes."""
-    return interquartile_mean(training.episodes.scores)
+def one_a_seed(runs: Sequence[Training], value: Callable[[Training], Any]) -> dict[int, Any]:
+    """Return a value of each seed; that of several runs of one seed, which only a mixed group has, is their mean."""
+    found = defaultdict(list)
+    for run in runs:
+        found[int(run.config["seed"])].append(value(run))
+    return {seed: np.mean(values, axis=0) for seed, values in sorted(found.items())}
 
 
 def group_of(runs: Sequence[Training], by: Sequence[str]) -> Group:
-    """One score a seed of the runs of a group; runs of the same seed, which only a mixed group has, are averaged.
+    """Return a group with one score a seed: the interquartile mean of the seed's evaluated episodes.
 
     Seeds that play equal games, as those that collapsed alike do, count like any other: to train others in their place
     would choose among the seeds by their scores.
     """
-    scores = defaultdict(list)
-    for run in runs:
-        scores[int(run.config["seed"])].append(scored(run))
-    return Group(values_of(runs[0], by), {seed: float(np.mean(found)) for seed, found in sorted(scores.items())})
+    scores = one_a_seed(runs, lambda run: interquartile_mean(run.episodes.scores))
+    return Group(values_in(runs[0].facts, by), {seed: float(score) for seed, score in scores.items()})
 
 
 def families(groups: Sequence[Group], question: Question) -> list[Family]:
@@ -195,3 +198,33 @@ def wanted(answers: Sequence[Answer]) -> dict[str, list[int]]:
                 for group in members:
                     lacking[group.label] |= {seed} - group.seeds.keys()
     return {label: sorted(seeds) for label, seeds in sorted(lacking.items()) if seeds}
+
+
+def worse_than_baseline(answers: Sequence[Answer], by: Sequence[str]) -> list[str]:
+    """Say which groups are worse than the baseline and differ from it in their commit alone, and by how much."""
+    place = list(by).index(COMMIT)
+
+    def others(answer: Answer, value: str) -> set[tuple[str, ...]]:
+        return {group.values[:place] + group.values[place + 1 :] for group in answer.family.groups[value]}
+
+    def commits(answer: Answer, value: str) -> set[str]:
+        return {group.values[place] for group in answer.family.groups[value]}
+
+    base = {commit for each in answers if (name := each.family.plan.baseline) for commit in commits(each, name)}
+    lines = []
+    for each in answers:  # also a family without the baseline, as of the groups behind its average
+        for verdict in each.decision.verdicts:
+            match verdict.said:
+                case "worse":
+                    worse, better, low, high = verdict.group, verdict.other, -verdict.high, -verdict.low
+                case "better":
+                    worse, better, low, high = verdict.other, verdict.group, verdict.low, verdict.high
+                case _:
+                    continue
+            is_of_baseline = commits(each, better) == base and commits(each, worse) != base
+            if is_of_baseline and others(each, worse) == others(each, better):
+                lines.append(
+                    f"{worse} by {abs(verdict.difference):,.0f} points ({low:,.0f} to {high:,.0f}, "
+                    f"{verdict.seeds} seeds each)"
+                )
+    return lines

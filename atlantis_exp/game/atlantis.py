@@ -6,12 +6,9 @@ fires once a press, so that an action that is held fires once.
 
 from collections.abc import Sequence
 
-from atlantis_exp.registry import component
-
 _WAVE_STATE, _WAVE_OVER = 0x53, 2  # a byte of the console's memory; so from the frame of the bonus to the next wave
 
 
-@component("atlantis", "env")
 class Atlantis:
     """The game that this package is about.
 

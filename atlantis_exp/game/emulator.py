@@ -10,7 +10,7 @@ from ale_py.roms import get_all_rom_ids, get_rom_path
 
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.game.preprocessing import PALETTE, SCREEN_HEIGHT, SCREEN_WIDTH, Pixels, Preprocessing
-from atlantis_exp.registry import Game
+from atlantis_exp.games import Game
 
 ALEInterface.setLoggerMode(LoggerMode.Error)  # of the whole process, and before the first emulator prints its banner
 
@@ -85,11 +85,6 @@ class Emulator:
         """As ALE counts them; in some games they can rise again."""
         return self._ale.lives()
 
-    @property
-    def screen(self) -> Pixels:
-        """A copy of the frame on screen, (210, 160) palette indices."""
-        return self._screen.copy()
-
     def screen_rgb(self) -> Pixels:
         """Returns the frame on screen in colour, (210, 160, 3) uint8."""
         return PALETTE.take(self._screen, axis=0)
@@ -150,10 +145,15 @@ class Emulator:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Plays the episode again up to where it was: a second for some 4,000 steps."""
+        """Play the episode again up to where it was: a second for some 4,000 steps. Raises: ValueError, IndexError."""
+        if len(state["actions"]) > self._ale.getInt("max_num_frames_per_episode"):
+            raise ValueError("its episode is longer than an episode can be")
         if not self._is_loaded:
             self._load_game(0)
-        self._ale.restoreState(ALEState(state["ale"].tobytes()))
+        try:
+            self._ale.restoreState(ALEState(state["ale"].tobytes()))
+        except SystemError:  # from C++, without a reason
+            raise ValueError("ALE cannot restore its state") from None
         self._generator.bit_generator.state = state["generator"]
         self._keep_origin()
         if state["begun"]:

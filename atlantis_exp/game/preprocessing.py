@@ -89,6 +89,8 @@ class FrameStack:
         return {"state": self.state}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        if (state["state"].shape, state["state"].dtype) != (self.state.shape, np.uint8):
+            raise ValueError("the stacks are not of this game's form")
         self.state = state["state"]
 
     def _replace(self, envs: Envs, stacks: Pixels) -> Pixels:

@@ -3,6 +3,7 @@
 import atexit
 import multiprocessing
 import os
+import select
 import signal
 from abc import ABC, abstractmethod
 from collections import deque
@@ -17,20 +18,23 @@ from typing import Any, NamedTuple, Self, final
 import cv2
 import numpy as np
 import numpy.typing as npt
+import psutil
 
 from atlantis_exp.faults import RunFault
 from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.preprocessing import Envs, Pixels
-from atlantis_exp.registry import Game
+from atlantis_exp.games import Game
 
 Rows = npt.NDArray[np.void]  # the last Step of each environment
 Calls = dict[int, tuple[Any, ...]]  # environment to the arguments of a call of its emulator
+
+_LAST_SECONDS = 5  # of patience, once the training is asked to stop
 
 _FOR_THE_PARENT = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 
 
 class WorkerDied(RunFault):
-    """A worker process has ended; the message names it, its environments and the cause."""
+    """A worker process has ended or hangs; the message names it, its environments and the cause."""
 
 
 class Steps(NamedTuple):
@@ -49,11 +53,12 @@ class Emulators(ABC):
     """Emulators of environments 0 to num_envs - 1, all of one game; none begins an episode by itself.
 
     `envs` are distinct, by default all. Several steps can be under way, of different environments each. Raises
-    RuntimeError where one is called whose step was sent and not received.
+    RuntimeError where one is called whose step was sent and not received. `stop` is asked while a worker hangs.
     """
 
     def __init__(self, num_envs: int, game: Game, rows: Rows) -> None:
         self.num_envs, self.game = num_envs, game
+        self.stop: Callable[[], bool] = lambda: False
         self._rows = rows
         self._sent: deque[Envs] = deque()  # the environments of each step that was sent and not received
         self._unheard = 0  # how many of these, the latest, were not waited for
@@ -154,8 +159,10 @@ class ProcessEmulators(Emulators):
     """Emulators in worker processes, which play between `send` and `receive`.
 
     Steps come through shared memory without a name, all else through pipes. Workers leave signals to this process and
-    end when it does. Waiting for one that has ended raises WorkerDied, once the others are ended too.
+    end when it does. Waiting for one that has ended or hangs raises WorkerDied, once the others are ended too.
     """
+
+    patience = 60.0  # seconds that a worker may neither answer nor use the processor
 
     def __init__(self, make: Callable[[], Emulator], num_envs: int, workers: int) -> None:
         row = _row(first := make())  # and what `make` raises, it raises here
@@ -165,6 +172,7 @@ class ProcessEmulators(Emulators):
         self._envs = [range(worker, num_envs, workers) for worker in range(workers)]
         self._connections: list[Connection[Any, Any]] = []
         self._processes: list[multiprocessing.context.SpawnProcess] = []
+        self._polls: list[select.poll] = []  # of the connections, since theirs takes as long as a step
         cores = _cores_for(workers)
         atexit.register(self.close)  # multiprocessing's own exit waits for workers that are deaf to its SIGTERM
         with _signals_held():
@@ -175,6 +183,8 @@ class ProcessEmulators(Emulators):
                 process.start()
                 theirs.close()  # the worker now holds the only other end, so its death ends the pipe
                 self._connections.append(connection)
+                self._polls.append(select.poll())
+                self._polls[-1].register(connection, select.POLLIN)
                 self._processes.append(process)
 
     def close(self) -> None:
@@ -182,7 +192,7 @@ class ProcessEmulators(Emulators):
         for connection, process in zip(self._connections, self._processes, strict=True):
             connection.close()
             process.kill()
-            process.join()
+            process.join(_LAST_SECONDS)  # longer where the kernel holds it, as for a lost disk
 
     def _start(self, method: str, calls: Calls) -> None:
         for envs, connection in zip(self._envs, self._connections, strict=True):
@@ -193,14 +203,30 @@ class ProcessEmulators(Emulators):
         results: dict[int, Any] = {}
         for worker, connection in enumerate(self._connections):
             try:
-                played, error = connection.recv()
+                played, error = ({}, f"hangs: {hung}") if (hung := self._wait_for(worker)) else connection.recv()
             except (EOFError, ConnectionError):
-                played, error = {}, _cause_of_death(self._processes[worker])
+                played, error = {}, f"died of {_cause_of_death(self._processes[worker])}"
             if error is not None:
                 self.close()
-                raise WorkerDied(f"emulator worker {worker}, environments {list(self._envs[worker])}, died of {error}")
+                raise WorkerDied(f"emulator worker {worker}, environments {list(self._envs[worker])}, {error}")
             results |= played
         return results
+
+    def _wait_for(self, worker: int) -> str:
+        """Wait for a worker's answer; return why no longer, empty if there is one.
+
+        Seconds are counted by looks: a process that was suspended together with its workers has not waited.
+        """
+        idle, used = 0, -1.0
+        while not self._polls[worker].poll(1_000):  # ms
+            try:
+                times = psutil.Process(self._processes[worker].pid).cpu_times()
+            except psutil.Error:
+                return ""  # it has died, which the connection tells
+            idle, used = (idle + 1, used) if times.user + times.system == used else (0, times.user + times.system)
+            if idle >= self.patience or (idle >= _LAST_SECONDS and self.stop()):
+                return f"no answer and no work for {idle} s"
+        return ""
 
 
 def make_emulators(make: Callable[[], Emulator], num_envs: int, workers: int) -> Emulators:
@@ -279,7 +305,7 @@ def _work(
     except (EOFError, ConnectionError):
         pass
     except Exception as error:
-        connection.send(({}, repr(error)))
+        connection.send(({}, f"died of {error!r}"))
 
 
 def _cause_of_death(process: "multiprocessing.context.SpawnProcess") -> str:

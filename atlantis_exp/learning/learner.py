@@ -1,7 +1,7 @@
 """The learner: two networks, an optimizer, and the update that moves them."""
 
 import copy
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, Literal
@@ -107,27 +107,30 @@ class Learner(ActionValues):
         if weights is None:
             weights = np.ones(len(a_t), np.float32)
         shards = self._shards(s_t, a_t, r_t, s_tpm, discount, weights)
-        parts = self._each(shards)(partial(self._gradients, len(a_t)), *shards)
+        parts = self._map_shards(partial(self._gradients, len(a_t)), shards)
         gradients, means, errors = zip(*parts, strict=True)
-        total, *others = gradients
-        for other in others:
-            torch._foreach_add_(total, other)
-        for parameter, gradient in zip(_learned(self.network), total, strict=True):
+        for parameter, gradient in zip(_learned(self.network), _summed(gradients), strict=True):
             parameter.grad = gradient
         self._measure(torch.stack(means).sum(0))
         self.optimizer.step()
-        self._online.refresh()
         self.updates += 1
+        self._online.refresh()
+        self._move_target()
+        self._move_average()
+        return torch.cat(errors)
+
+    def _move_target(self) -> None:
         if self.updates % self.target_every == 0:
             _follow(self.target, self.network, self.tau, buffers=self.target_mode == "eval")
             self._target.refresh()
+
+    def _move_average(self) -> None:
         if self.ema and self.updates % _AVERAGE_EVERY == 0:
             # From random weights, a plain mean of all so far, until there are as many as are asked for.
             first = 0.0 if self._has_begun_with else _AVERAGE_EVERY / self.updates
             share = max(first, _AVERAGE_EVERY / self.ema)
             _follow(self.evaluated, self.network, share, buffers=True)
             self._evaluated.refresh()
-        return torch.cat(errors)
 
     def _gradients(
         self,
@@ -244,20 +247,9 @@ class Learner(ActionValues):
         """Continue exactly where the learner stood that `state_dict` described.
 
         Raises:
-            ValueError: where what the optimizer keeps of one parameter is not of the form of the others'.
+            ValueError: where the next update would break off.
         """
-        parameters = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
         kept = {int(index): values for index, values in state["optimizer"].items()}
-        names = {frozenset(values) for values in kept.values()}
-        of_its_size = {
-            frozenset(
-                name for name, value in values.items() if getattr(value, "shape", None) == parameters[index].shape
-            )
-            for index, values in kept.items()
-            if parameters[index].dim()  # a parameter that is one number is as large as the count of its steps
-        }
-        if len(names) > 1 or len(of_its_size) > 1:  # torch's load takes it, and the next update breaks off
-            raise ValueError("the optimizer's state does not fit its parameters")
         self.network.load_state_dict(state["network"])
         self.target.load_state_dict(state["target"])
         self.optimizer.load_state_dict(
@@ -269,16 +261,40 @@ class Learner(ActionValues):
         self.learning_rate = state["learning_rate"]
         for name, generator in self._generators().items():
             generator.set_state(state["generators"][name].cpu())
-        self.updates = state["updates"]
+        self._check_optimizer()
+        self.updates, self._measured = int(state["updates"]), int(state["measured"])
+        if not 0 <= self._measured <= self.updates < 2**53:
+            raise ValueError(f"{self._measured} of {self.updates} updates are measured")
         self._has_begun_with = state.get("has_begun_with", False)
         self._sums.copy_(state["sums"])
-        self._measured = state["measured"]
         self._first_nonfinite.copy_(state["first_nonfinite"])
         if self.ema:
             self.evaluated.load_state_dict(state["evaluated"])
             self._evaluated.refresh()
         self._online.refresh()
         self._target.refresh()
+
+    def _check_optimizer(self) -> None:
+        """Compare what the optimizer has loaded with what it keeps after a step; torch does not. Raises: ValueError."""
+
+        def form(optimizer: torch.optim.Optimizer) -> dict[int, dict[str, object]]:
+            state = optimizer.state_dict()["state"].items()
+            return {
+                index: {
+                    name: isinstance(value, torch.Tensor) and (value.shape, value.dtype) for name, value in kept.items()
+                }
+                for index, kept in state
+            }
+
+        trial = copy.deepcopy(self.optimizer)
+        trial.state.clear()
+        for group in trial.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = torch.zeros_like(parameter) if parameter.requires_grad else None
+        trial.step()
+        steps = [kept["step"].item() for kept in self.optimizer.state.values() if "step" in kept]
+        if self.optimizer.state and (form(self.optimizer) != form(trial) or not all(step >= 0 for step in steps)):
+            raise ValueError("the optimizer's state does not fit its parameters")
 
     def _measure(self, means: torch.Tensor) -> None:
         gradient_norm = nn.utils.get_total_norm([p.grad for p in self.network.parameters() if p.grad is not None])
@@ -296,8 +312,16 @@ class Learner(ActionValues):
         }
 
 
+def _summed(gradients: Sequence[list[torch.Tensor]]) -> list[torch.Tensor]:
+    """Add the shards' gradients, parameter by parameter, into the first shard's."""
+    total, *others = gradients
+    for other in others:
+        torch._foreach_add_(total, other)
+    return total
+
+
 def _learned(network: nn.Module) -> list[nn.Parameter]:
-    """The parameters that are not frozen."""
+    """Return the parameters that are not frozen."""
     return [parameter for parameter in network.parameters() if parameter.requires_grad]
 
 

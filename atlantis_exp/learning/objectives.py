@@ -2,13 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal, Protocol, TypeAlias
+from typing import ClassVar, Protocol, TypeAlias
 
 import torch
-from annotated_types import Interval
 from torch.nn.functional import smooth_l1_loss
 
-from atlantis_exp.components import component
+from atlantis_exp.components import Quantiles, Rescaling
 
 QFunction: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
 """States (B, C, H, W) in [0, 1] to float32 values (B, A), or to N quantiles of each (B, A, N), without gradient and in
@@ -38,7 +37,6 @@ def action_values(q: torch.Tensor) -> torch.Tensor:
     return q if q.ndim == 2 else q.mean(2)
 
 
-@component("dqn", "objective")
 @dataclass(frozen=True)
 class DQN:
     """The target network chooses the next action and values it (Mnih et al. 2015; report figure 2.5)."""
@@ -56,7 +54,6 @@ class DQN:
         return smooth_l1_loss(taken(q, a_t), target, reduction="none")
 
 
-@component("double_dqn", "objective")
 @dataclass(frozen=True)
 class DoubleDQN(DQN):
     """The online network chooses the next action, the target network values it (van Hasselt et al. 2016, equation 4).
@@ -70,7 +67,6 @@ class DoubleDQN(DQN):
         return taken(target(s_tpm), a_tpm)
 
 
-@component("quantile", "objective")
 @dataclass(frozen=True)
 class Quantile(DQN):
     """QR-DQN: N quantiles of the return, whose mean is the value (Dabney et al. 2018, algorithm 1, kappa 1).
@@ -79,7 +75,7 @@ class Quantile(DQN):
     """
 
     head: ClassVar = "quantile"
-    quantiles: Annotated[int, Interval(ge=1, le=1_000)]  # a sample of an update holds N x N differences
+    quantiles: Quantiles
 
     def losses(self, q: torch.Tensor, a_t: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Return the quantile Huber loss of each sample, (B,): a sum over its quantiles, a mean over the target's."""
@@ -91,7 +87,6 @@ class Quantile(DQN):
         return (weight_BNN * smooth_l1_loss(z_BNN, target_BNN, reduction="none")).mean(2).sum(1)
 
 
-@component("double_quantile", "objective")
 @dataclass(frozen=True)
 class DoubleQuantile(Quantile, DoubleDQN):
     """QR-DQN whose online network chooses the next action, as in Double DQN; the target network gives its quantiles."""
@@ -102,7 +97,7 @@ class _Rescaled(DQN):
     """Learns h(return) for an h that makes large returns small, so that rewards need no clip; h is undone before
     rewards are added (Pohlen et al. 2018, equation 5)."""
 
-    rescaling: Literal["signed_sqrt", "symlog"]
+    rescaling: Rescaling
 
     def targets(
         self, r_t: torch.Tensor, s_tpm: torch.Tensor, discount: torch.Tensor, online: QFunction, target: QFunction
@@ -111,13 +106,11 @@ class _Rescaled(DQN):
         return rescale(bootstrapped(r_t, discount, undo(self._next_values(s_tpm, online, target))))
 
 
-@component("rescaled_double_dqn", "objective")
 @dataclass(frozen=True)
 class RescaledDoubleDQN(_Rescaled, DoubleDQN):
     """Double DQN on rescaled returns, as in R2D2 (Kapturowski et al. 2019)."""
 
 
-@component("rescaled_quantile", "objective")
 @dataclass(frozen=True)
 class RescaledQuantile(_Rescaled, Quantile):
     """QR-DQN on rescaled returns, whose quantiles are those of the returns, rescaled.

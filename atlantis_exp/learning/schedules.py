@@ -2,16 +2,9 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Protocol
+from typing import Protocol
 
-from annotated_types import Interval
-
-from atlantis_exp.components import component
-
-Probability = Annotated[float, Interval(ge=0, le=1)]
-Positive = Annotated[float, Interval(gt=0)]
-Share = Annotated[float, Interval(gt=0, lt=1)]
-Count = Annotated[int, Interval(ge=1, le=1_000_000_000_000)]
+from atlantis_exp.components import Count, Positive, Probability, Share
 
 
 class Schedule(Protocol):
@@ -20,7 +13,6 @@ class Schedule(Protocol):
     def __call__(self, progress: float, steps: int) -> float: ...
 
 
-@component("constant", "epsilon", "lr_schedule")
 @dataclass(frozen=True)
 class Constant:
     """The same value throughout."""
@@ -31,7 +23,6 @@ class Constant:
         return self.value
 
 
-@component("linear", "epsilon", "lr_schedule")
 @dataclass(frozen=True)
 class Linear:
     """A straight line from `start` to `end` over the first `duration` of the training, then `end`."""
@@ -45,7 +36,6 @@ class Linear:
         return self.end + (self.start - self.end) * remaining
 
 
-@component("linear_steps", "epsilon")
 @dataclass(frozen=True)
 class LinearSteps:
     """A straight line from `start` to `end` over the first `steps`, then `end`, however long the training is."""
@@ -58,7 +48,6 @@ class LinearSteps:
         return Linear(self.start, self.end, self.steps)(steps, steps)
 
 
-@component("exponential", "epsilon")
 @dataclass(frozen=True)
 class Exponential:
     """A value whose distance to `end` shrinks by a factor e per `decay` and never quite vanishes (report figure 4.1).
@@ -74,7 +63,6 @@ class Exponential:
         return self.end + (self.start - self.end) * math.exp(-progress / self.decay)
 
 
-@component("one_cycle", "lr_schedule")
 @dataclass(frozen=True)
 class OneCycle:
     """Up from `start` to 1 over the first `rise` of the training and down to `end` over the rest, each half a cosine.

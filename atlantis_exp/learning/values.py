@@ -1,10 +1,10 @@
 """A network's action values, computed on all cores."""
 
 import copy
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ from torch import nn
 
 from atlantis_exp.learning.objectives import action_values
 
-Shards = list[Sequence[Any]]
+T = TypeVar("T")
 
 
 def generators_of(network: nn.Module) -> Iterator[tuple[str, torch.Generator]]:
@@ -84,8 +84,7 @@ class ActionValues:
         return self.all_values(self._online, states)
 
     def all_values(self, replicas: Replicas, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
-        shards = self._shards(states)
-        return np.concatenate([*self._each(shards)(partial(self._values, replicas), *shards)])
+        return np.concatenate(self._map_shards(partial(self._values, replicas), self._shards(states)))
 
     @torch.inference_mode()
     def _values(self, replicas: Replicas, shard: int, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
@@ -93,14 +92,15 @@ class ActionValues:
         values: npt.NDArray[np.float32] = action_values(q).cpu().numpy()
         return values
 
-    def _shards(self, *batch: npt.NDArray[Any]) -> Shards:
-        """Return the shards' numbers, then each array of a batch in as many parts, none of them empty."""
+    def _shards(self, *batch: npt.NDArray[Any]) -> list[tuple[npt.NDArray[Any], ...]]:
+        """Return the arrays of a batch cut into shards, none of them empty."""
         count = min(self.shards, len(batch[0]))
-        return [range(count), *(np.array_split(array, count) for array in batch)]
+        return [*zip(*(np.array_split(array, count) for array in batch), strict=True)]
 
-    def _each(self, shards: Shards) -> Callable[..., Iterable[Any]]:
-        """Return what maps a function over shards: in a thread each, one alone in this one."""
-        return map if len(shards[0]) == 1 else self._threads.map
+    def _map_shards(self, function: Callable[..., T], shards: Sequence[tuple[npt.NDArray[Any], ...]]) -> list[T]:
+        """Call a function with the number and the arrays of each shard, in a thread each; a lone one in this thread."""
+        over = map if len(shards) == 1 else self._threads.map
+        return [*over(function, range(len(shards)), *zip(*shards, strict=True))]
 
     def _input(self, states: npt.NDArray[np.uint8]) -> torch.Tensor:
         """Return states in [0, 1] in the precision of the forward pass, channels last."""

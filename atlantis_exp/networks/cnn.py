@@ -3,12 +3,10 @@
 import torch
 from torch import nn
 
-from atlantis_exp.components import component
 from atlantis_exp.networks.heads import Head
 from atlantis_exp.networks.sizes import check_sides, convolved
 
 
-@component("cnn", "model")
 class DQNCnn(nn.Module):
     """Three convolutions and two dense layers (report figure 2.1; Mnih et al. 2015).
 

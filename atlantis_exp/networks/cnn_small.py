@@ -3,12 +3,10 @@
 import torch
 from torch import nn
 
-from atlantis_exp.components import component
 from atlantis_exp.networks.heads import Head
 from atlantis_exp.networks.sizes import check_sides, convolved
 
 
-@component("cnn_small", "model")
 class SmallCnn(nn.Module):
     """Two convolutions and one hidden layer (Mnih et al. 2013, section 4.1): three tenths of DQNCnn's FLOPs at 84x84.
 

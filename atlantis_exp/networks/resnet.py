@@ -3,7 +3,6 @@
 import torch
 from torch import nn
 
-from atlantis_exp.components import component
 from atlantis_exp.networks.dropout import Dropout
 from atlantis_exp.networks.heads import Head
 from atlantis_exp.networks.sizes import check_sides, convolved
@@ -40,7 +39,6 @@ class ResNetBlock(nn.Module):
         return y
 
 
-@component("resnet", "model")
 class ResNetDQN(nn.Module):
     """Fourteen convolutions in the main path, four of them the stem, and two dense layers (report figure 2.2).
 

@@ -3,7 +3,6 @@
 import torch
 from torch import nn
 
-from atlantis_exp.components import component
 from atlantis_exp.networks.heads import Head
 from atlantis_exp.networks.sizes import check_sides, convolved
 
@@ -25,7 +24,6 @@ class ResidualBlock(nn.Module):
         return y
 
 
-@component("resnet_fast", "model")
 class ResNetFast(nn.Module):
     """A residual network whose stem shrinks the sides at once: 0.20 GFLOP a sample of an update at 159x159.
 

@@ -6,6 +6,8 @@ import lz4.block
 import numpy as np
 import numpy.typing as npt
 
+from atlantis_exp.faults import Fault
+
 
 class FrameStore:
     """Ring of compressed uint8 frames with consecutive ids that never takes more than `budget_bytes`.
@@ -82,13 +84,24 @@ class FrameStore:
         self.next_id += 1
 
     def decode(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
-        """Return the frames of stored `ids` as a fresh array of shape `(*ids.shape, *frame_shape)`."""
+        """Return the frames of stored `ids` as a fresh array of shape `(*ids.shape, *frame_shape)`.
+
+        Raises:
+            Fault: a loaded segment holds bytes that are not a frame.
+        """
         size = self.frame_bytes
         frames = np.empty((*ids.shape, *self.frame_shape), np.uint8)
         target = frames.reshape(-1).data
         for i, (start, stop) in enumerate(self._spans(ids.ravel()).tolist()):
             data = self._buffer[start:stop]
-            target[i * size : (i + 1) * size] = lz4.block.decompress(data, uncompressed_size=size, dict=self.dictionary)
+            try:
+                frame = lz4.block.decompress(data, uncompressed_size=size, dict=self.dictionary)
+                target[i * size : (i + 1) * size] = frame
+            except (lz4.block.LZ4BlockError, ValueError) as error:
+                raise Fault(
+                    f"the replay memory holds bytes that are not an observation ({error}); resume=never keeps what is "
+                    "there and begins anew"
+                ) from None
         return frames
 
     def segment(self, first_id: int) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint8]]:

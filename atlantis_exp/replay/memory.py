@@ -252,7 +252,12 @@ class ReplayMemory:
 
     def is_under_way(self, env: int) -> bool:
         """Tell whether an environment has an episode that steps can be added to."""
-        return env in self._newest
+        return env in self._newest and self.next_id - self._newest[env] <= _MAX_BACK
+
+    @property
+    def highest_action(self) -> int:
+        """Return the highest action of any step, 0 before there is one."""
+        return int(self._action.max())
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything in one segment."""

@@ -1,19 +1,19 @@
 """Which transitions to learn from."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from annotated_types import Interval
 
-from atlantis_exp.components import component
+from atlantis_exp.components import Oversample, Probability
+from atlantis_exp.faults import Fault
 from atlantis_exp.replay.memory import ReplayMemory
-
-Probability = Annotated[float, Interval(ge=0, le=1)]
 
 _MOST_ERROR = 1e30  # so that the sum of all priorities is finite
 _LEAST_ERROR = 1e-6  # added to every error, so that each transition may come again
+_MOST_PRIORITY = 2 * _MOST_ERROR
+_FOREIGN = "the sampler's priorities are not of this replay memory; resume=never keeps what is there and begins anew"
 
 
 class Draw(NamedTuple):
@@ -50,7 +50,6 @@ class _Stateless:
         pass
 
 
-@component("uniform", "sampler")
 @dataclass(frozen=True)
 class UniformSampler(_Stateless):
     """Every available transition is as likely as any other."""
@@ -60,7 +59,6 @@ class UniformSampler(_Stateless):
         return Draw(memory.draw(batch_size, rng), None)
 
 
-@component("top_half", "sampler")
 @dataclass(frozen=True)
 class TopHalfSampler(_Stateless):
     """Of `oversample` times the batch drawn uniformly, the transitions of highest reward, best first.
@@ -69,7 +67,7 @@ class TopHalfSampler(_Stateless):
     then take only the top half". Of equal rewards the one drawn earlier comes first.
     """
 
-    oversample: Annotated[int, Interval(ge=2, le=64)]
+    oversample: Oversample
 
     def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> Draw:
         """Draw `batch_size` transitions, chosen by the game's rewards alone; ValueError if there are none."""
@@ -77,7 +75,6 @@ class TopHalfSampler(_Stateless):
         return Draw(ids[np.argsort(-memory.rewards(ids), kind="stable")[:batch_size]], None)
 
 
-@component("prioritized", "sampler")
 class PrioritizedSampler:
     """A transition is as likely as its last error to the power `alpha` (Schaul et al. 2016, proportional).
 
@@ -132,11 +129,14 @@ class PrioritizedSampler:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where the sampler stood that `state_dict` described."""
-        self._plant(state["priorities"])
-        self._highest = state["highest"]
-        self._oldest_id = state["oldest_id"]
-        self._next_id = state["next_id"]
+        """Continue exactly where the sampler stood that `state_dict` described. Raises: ValueError."""
+        priorities, highest = state["priorities"], float(state["highest"])
+        if priorities.dtype != np.float64 or not np.all((priorities >= 0) & (priorities <= _MOST_PRIORITY)):
+            raise ValueError("the sampler's priorities are not numbers from 0 up")
+        if not 0 < highest <= _MOST_PRIORITY:
+            raise ValueError(f"the sampler's highest priority is {highest}")
+        self._plant(priorities)
+        self._highest, self._oldest_id, self._next_id = highest, int(state["oldest_id"]), int(state["next_id"])
 
     @property
     def _leaves(self) -> npt.NDArray[np.float64]:
@@ -152,6 +152,8 @@ class PrioritizedSampler:
         """Forget what the memory has forgotten, and take in what is new."""
         if not self._next_id:
             self._plant(np.zeros(memory.capacity))
+        if self._capacity != memory.capacity or not 0 <= self._oldest_id <= self._next_id <= memory.next_id:
+            raise Fault(_FOREIGN)
         gone = np.arange(self._oldest_id, min(memory.oldest_id, self._oldest_id + memory.capacity))
         self._set(gone % memory.capacity, np.zeros(len(gone)))
         new = memory.completed(self._next_id)
@@ -167,6 +169,8 @@ class PrioritizedSampler:
 
     def _find(self, shares: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
         """Return the slots that lie at these shares, in [0, 1), of the sum of all priorities."""
+        if not self._tree[1] > 0:  # nothing would ever be found
+            raise Fault(_FOREIGN)
         rest = shares * self._tree[1]
         nodes = np.ones(len(shares), np.int64)
         while nodes[0] < len(self._tree) // 2:

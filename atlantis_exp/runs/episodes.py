@@ -1,4 +1,4 @@
-"""The table of evaluated episodes: what an evaluation writes and a comparison reads, one row an episode."""
+"""Read and write the table of evaluated episodes, one row each."""
 
 import csv
 import io
@@ -30,7 +30,7 @@ class EpisodeTable:
     sources: tuple[str, ...]  # what pays points
 
     def to_csv(self) -> str:
-        """The table with a header; steps by action, those of them that chance chose, and points by source."""
+        """Return the table with a header: steps by action, those that chance chose, and points by source."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         by_chance = [f"{action}_random" for action in self.actions]
@@ -44,13 +44,13 @@ class EpisodeTable:
 
     @classmethod
     def read(cls, path: Path, sources: Sequence[str] = ()) -> Self:
-        """The table in a file, and of its points those of these sources. Raises: ValueError, OSError."""
+        """Read a file's table, and of its points those of these sources. Raises: ValueError, OSError."""
         try:
             header, *lines = csv.reader(io.StringIO(read_file(path, SMALL).decode(), newline=""), strict=True)
             rows = [dict(zip(header, line, strict=True)) for line in lines]
             return cls._of(rows, sources)
         except (ValueError, KeyError, csv.Error) as error:
-            raise ValueError(f"{path} is no table of episodes: {error}") from None
+            raise ValueError(f"{path} is not a table of episodes: {error}") from None
 
     @classmethod
     def _of(cls, rows: Sequence[Mapping[str, str]], sources: Sequence[str]) -> Self:
@@ -67,4 +67,7 @@ class EpisodeTable:
         seeds = np.array([int(row["seed"]) for row in rows])
         points = np.array([[float(row.get(source, "nan")) for source in sources] for row in rows])
         counts = np.stack((both - chance, chance), axis=2)
+        for numbers in (scores, steps, frames, truncated, counts, np.nan_to_num(points)):
+            if not np.all(np.abs(numbers) <= 1e15):  # whose squares a mean still holds
+                raise ValueError("it has numbers beyond 1e15")
         return cls(actions, seeds, scores, steps, frames, truncated, counts, points, tuple(sources))

@@ -1,19 +1,24 @@
-"""Files of run folders: put in place whole, and read within bounds, since whatever is read may be anybody's.
+"""Write files of run folders whole, and read them within bounds, since they may come from anybody.
 
-No link is followed: it would lead to a file of whoever reads or writes here.
+No symbolic link is followed, and no hard link written through: both lead to files of another folder.
 """
 
 import errno
 import hashlib
 import os
+import shutil
 import stat
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Annotated, Any, BinaryIO, TypeVar
 
-from pydantic import TypeAdapter
+from pydantic import Field, TypeAdapter, ValidationError
 from pydantic_core import from_json
 
 T = TypeVar("T")
+
+Natural = Annotated[int, Field(ge=0, lt=2**63)]
 
 SMALL = 2**24  # bytes; what a run says of itself has some kilobytes, a table of 20,000 episodes two megabytes
 ARTIFACT = 2**30  # bytes, of a film or a network
@@ -23,14 +28,23 @@ _schemas: dict[Any, TypeAdapter[Any]] = {}
 
 
 def schema_of(kind: type[T]) -> TypeAdapter[T]:
-    """What checks and makes instances of a class; built at first need, as all together take a tenth of a second."""
+    """Return what checks and makes instances of a class; making all at import would take a tenth of a second."""
     if kind not in _schemas:
         _schemas[kind] = TypeAdapter(kind)
     return _schemas[kind]
 
 
+def checked(kind: type[T], values: Mapping[str, Any]) -> T:
+    """Make an instance of a class from plain values. Raises: ValueError, in one line."""
+    try:
+        return schema_of(kind).validate_python(values)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+
+
 def open_file(path: Path) -> BinaryIO:
-    """Open a regular file for reading. Raises: OSError, ValueError where it is of another kind."""
+    """Open a regular file for reading. Raises: OSError, ValueError if it is of another kind."""
     try:
         file = open(path, "rb", opener=no_link)  # noqa: SIM115
     except OSError as error:
@@ -44,7 +58,7 @@ def open_file(path: Path) -> BinaryIO:
 
 
 def read_file(path: Path, most: int) -> bytes:
-    """The content of a regular file of at most so many bytes. Raises: OSError, ValueError."""
+    """Return the content of a regular file of at most `most` bytes. Raises: OSError, ValueError."""
     with open_file(path) as file:
         if (size := os.fstat(file.fileno()).st_size) > most:
             raise ValueError(f"{path} has {size:,} bytes, more than {most:,}")
@@ -52,15 +66,28 @@ def read_file(path: Path, most: int) -> bytes:
 
 
 def no_link(path: str, flags: int) -> int:
-    """Open a file that is no symbolic link, as `opener` of `open`. Raises: OSError.
+    """Open a file, but not a symbolic link, as `opener` of `open`; a hard link is cut before it is written.
 
-    A pipe does not block: it would wait until somebody comes to its other end.
+    A pipe does not block, as it otherwise would until its other end is opened. Raises: OSError.
     """
+    if flags & (os.O_WRONLY | os.O_RDWR):
+        own(Path(path))
     return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
 
 
+def own(path: Path) -> None:
+    """Replace a regular file that has a second name, as after `cp -al`, by a copy of its own. Raises: OSError."""
+    with suppress(FileNotFoundError):
+        found = path.lstat()
+        if stat.S_ISREG(found.st_mode) and found.st_nlink > 1:
+            aside = path.with_name(path.name + ".own")
+            aside.unlink(missing_ok=True)
+            shutil.copy2(path, aside)
+            aside.replace(path)
+
+
 def inside(folder: Path, path: str) -> Path:
-    """The file in a folder of a run that a path names. Raises: ValueError where it, or a link, leads out of it."""
+    """Return the file in a run's folder that a path names. Raises: ValueError if it, or a link, leads out of it."""
     root = folder.parent.resolve() / folder.name
     file = (root / path).resolve()
     if root not in file.parents:
@@ -69,12 +96,12 @@ def inside(folder: Path, path: str) -> Path:
 
 
 def is_whole(content: bytes, sha256: str) -> bool:
-    """Whether a content has a checksum; an empty one, as 0.1.0 left it, is not known."""
+    """Tell whether a content has a checksum; an empty one, as 0.1.0 left it, fits any content."""
     return sha256 in ("", hashlib.sha256(content).hexdigest())
 
 
 def read_object(content: bytes) -> dict[str, Any]:
-    """The object that JSON holds, of bounded depth. Raises: ValueError."""
+    """Return the object that JSON of bounded depth holds. Raises: ValueError."""
     tree = from_json(content)  # has a bound of its own, where `json` ends in RecursionError
     if not isinstance(tree, dict):
         raise ValueError(f"should be an object, is {type(tree).__name__}")
@@ -82,7 +109,7 @@ def read_object(content: bytes) -> dict[str, Any]:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it, where they are missing, durably."""
+    """Make a folder and its missing parents durable."""
     if not folder.is_dir():
         make_folder(folder.parent)
         folder.mkdir(exist_ok=True)
@@ -90,7 +117,7 @@ def make_folder(folder: Path) -> None:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Put a file in place whole, durably, or not at all."""
+    """Put a file in place whole and durable, or not at all. Raises: OSError."""
     make_folder(path.parent)
     aside = path.with_name(path.name + ".aside")
     with open(aside, "wb", opener=no_link) as file:
@@ -101,8 +128,25 @@ def write_file(path: Path, content: bytes) -> None:
     _sync(path.parent)
 
 
+@contextmanager
+def whole(folder: Path) -> Iterator[Path]:
+    """Yield a folder to fill, which takes the place of `folder` when the block ends well and is removed otherwise.
+
+    Raises: OSError if it cannot be made, or `folder` is there and not empty.
+    """
+    aside = folder.with_name(folder.name + ".aside")
+    shutil.rmtree(aside, ignore_errors=True)
+    make_folder(aside)
+    try:
+        yield aside
+        aside.replace(folder)
+        _sync(folder.parent)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
 def _sync(folder: Path) -> None:
-    """Make durable which names are in a folder."""
+    """Make the names in a folder durable."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

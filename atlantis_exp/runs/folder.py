@@ -10,32 +10,28 @@ from typing import Any, Literal, Self, TypeVar
 from atlantis_exp.checking import nearest, parse
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
-from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.runs import lock
-from atlantis_exp.runs.files import SMALL, inside, read_file, schema_of, write_file
+from atlantis_exp.runs.files import SMALL, Natural, inside, read_file, schema_of, write_file
 from atlantis_exp.runs.journal import Commit, Record, Status, has_lost_commit, read, read_commit
 
 CONFIG, RESULT, COMMIT = "config.json", "result.json", "commit.json"
-TRACEBACK = "traceback.txt"
+CHECKPOINTS = "checkpoints"  # the folder of a training's
+TRACEBACK = "traceback.txt"  # of the run's latest failure
 LOOKS = "looks.json"  # of a comparison
-"""Why a run failed last, at length."""
-CHECKPOINTS = "checkpoints"
-"""The folder of a training's checkpoints."""
-OUTPUT = "output.txt"
-"""What a run that a launcher started printed."""
+OUTPUT = "output.txt"  # printed by a run that a launcher started
 
-# Names of artifacts.
+# Artifacts.
 EPISODES = "episodes.csv"  # of the training
 BEST_EPISODE = "best_episode.mp4"
-NETWORK = "network"
-"""The name of the models that are a training's networks."""
+NETWORK = "network"  # the models that are a training's networks
 EVALUATION, EVALUATION_REPORT = "evaluation/episodes.csv", "evaluation/report.txt"  # of a run that is one evaluation
 
-EVALUATED = {*(f"evaluation/{point}" for point in (*TABLE_COLUMNS, "episodes")), "actions/random_share"}
+TABLE_COLUMNS = ("mean", "standard_error", "median", "interquartile_mean", "high", "low")
+"""The parts of a summary of scores that a row of a table shows, in order."""
+EVALUATED = {*(f"evaluation/{point}" for point in (*TABLE_COLUMNS, "episodes", "epsilon")), "actions/random_share"}
 """The metrics of an evaluation that tables show."""
-LOST = "lost"
-"""The tag of a run that went on without a part of its replay memory: it is not the unbroken one bit for bit."""
-_HOLD_SECONDS = 2.0  # that a command waits for a run, which another may hold for a moment
+LOST = "lost"  # the tag of a run that lost a part of its replay memory: not the unbroken one bit for bit
+_HOLD_SECONDS = 2.0  # to wait for a run, which another command may hold for a moment
 
 State = Literal["done", "running", "failed", "interrupted", "queued"]
 T = TypeVar("T")
@@ -51,11 +47,11 @@ class Result:
     """How a run ended: the numbers of its last evaluation and the report's table of them."""
 
     outcome: str
-    steps: int
+    steps: Natural
     counts: dict[str, float]  # episodes, frames, updates and hours of a training
     evaluation: dict[str, float]  # empty where there was none
     report: str
-    evaluated_at: int | None = None  # step of the last evaluation, where that was before the last one
+    evaluated_at: Natural | None = None  # step of the last evaluation, if that was before the last one
 
     def __post_init__(self) -> None:
         if self.evaluation and (missing := EVALUATED - self.evaluation.keys()):

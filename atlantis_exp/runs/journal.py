@@ -11,12 +11,11 @@ import os
 import re
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache, partial
-from itertools import accumulate
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, Protocol, get_args
+from typing import Any, BinaryIO, Literal, get_args
 from uuid import uuid4
 
 from pydantic import ValidationError
@@ -24,6 +23,7 @@ from pydantic import ValidationError
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import (
     SMALL,
+    Natural,
     inside,
     make_folder,
     no_link,
@@ -109,9 +109,9 @@ class Commit:
     """
 
     identity: str
-    started: int
-    updated: int
-    offset: int
+    started: Natural
+    updated: Natural
+    offset: Natural
     status: Status
     error: str = ""
     labels: dict[str, str] = field(default_factory=dict)
@@ -125,62 +125,45 @@ class JournalError(Fault, ValueError):
 _POINT_BYTES = 2_000  # between two points of a curve that are worth reading; three lines of a journal, or so
 
 
-class Tracker(Protocol):
-    """What training may tell about itself."""
+class Tracker:
+    """What training may tell about itself; this one forgets everything."""
 
     def metrics(self, values: Mapping[str, float], step: int) -> None:
-        """Records values measured at a step."""
+        """Record values measured at a step."""
 
     def params(self, values: Mapping[str, str]) -> None:
-        """Records what the run was asked to do."""
+        """Record what the run was asked to do."""
 
     def tags(self, values: Mapping[str, str]) -> None:
-        """Records what is said about the run."""
+        """Record facts about the run."""
 
     def note(self, markdown: str) -> None:
-        """Describes the run and its result so far; the last note counts."""
+        """Describe the run and its result so far; the last note counts."""
 
     def artifact(self, path: str, content: bytes) -> None:
-        """Keeps a file under a relative path; the last content of a path counts."""
+        """Keep a file under a relative path; the last content of a path counts."""
 
     def image(self, key: str, content: bytes, step: int) -> None:
-        """Keeps a PNG at a position of its key's slider; runs that share positions are shown side by side."""
+        """Keep a PNG at a position of its key's slider; runs that share positions are shown side by side."""
 
     def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None:
-        """Keeps weights (safetensors) of a step and the metrics that they reached; `best` of all of the name so far."""
+        """Keep weights (safetensors) of a step and the metrics that they reached; `best` of all of the name so far."""
 
     def status(self, status: Status, error: str = "") -> None:
-        """Says what state the run is in and why it failed, and reveals nothing else."""
+        """Say what state the run is in and why it failed, and reveal nothing else."""
 
     def commit(self) -> None:
-        """Reveals all that the latest state holds; to be called once a checkpoint holding it is durable."""
+        """Reveal all that the latest state holds; to be called once a checkpoint holding it is durable."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Makes all records durable and returns where they end."""
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes back to where the state ends; later records are forgotten."""
-
-
-class NullJournal:
-    """A tracker that forgets everything."""
-
-    def metrics(self, values: Mapping[str, float], step: int) -> None: ...
-    def params(self, values: Mapping[str, str]) -> None: ...
-    def tags(self, values: Mapping[str, str]) -> None: ...
-    def note(self, markdown: str) -> None: ...
-    def artifact(self, path: str, content: bytes) -> None: ...
-    def image(self, key: str, content: bytes, step: int) -> None: ...
-    def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None: ...
-    def status(self, status: Status, error: str = "") -> None: ...
-    def commit(self) -> None: ...
-    def state_dict(self) -> dict[str, Any]:
+        """Make all records durable and return where they end."""
         return {}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None: ...
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go back to where the state ends; later records are forgotten."""
 
 
-class Journal:
+class Journal(Tracker):
     """A tracker that writes a run folder, which has one writer at a time.
 
     Without `load_state_dict` it begins an empty journal, even in a folder that holds one. Names of metrics, params,
@@ -206,14 +189,14 @@ class Journal:
         self._commit = replace(commit, labels={**commit.labels, **named})
 
     def resume(self) -> bool:
-        """Goes on behind what is committed, as a writer without checkpoints does; whether there is anything."""
+        """Go on after the last commit, as a writer without checkpoints does; return whether there is one."""
         if not self._commit.offset:
             return False
         self.load_state_dict({"offset": self._commit.offset, "time": self._commit.updated})
         return True
 
     def recover(self) -> None:
-        """Makes all that is in the folder count again, as where the `commit.json` of an ended run was removed."""
+        """Make all whole lines count again, for an ended run whose `commit.json` was removed."""
         with open_file(self._folder / "journal.jsonl") as file:
             self._offset = sum(len(line) for line in iter(partial(file.readline, SMALL), b"") if line.endswith(b"\n"))
         self.commit()
@@ -259,12 +242,12 @@ class Journal:
         self._mark(replace(self._commit, offset=self._offset))
 
     def flush(self) -> None:
-        """Makes all records durable and visible; for a writer without checkpoints."""
+        """Make all records durable and visible; for a writer without checkpoints."""
         self.state_dict()
         self.commit()
 
     def finish(self) -> None:
-        """Makes all records durable and visible, and says that there will be no more."""
+        """Make all records durable and visible, and say that there will be no more."""
         self.flush()
         self.status("FINISHED")
 
@@ -272,7 +255,7 @@ class Journal:
         if self._offset < self._commit.offset:
             self._mark(replace(self._commit, offset=self._offset))  # readers first: the bytes change under them next
         content = b"".join(self._lines)
-        _write_from(self._folder, self._offset, [content])
+        _write_from(self._folder, self._offset, content)
         self._offset += len(content)
         self._lines.clear()
         return {"offset": self._offset, "time": self._time}
@@ -302,7 +285,7 @@ class Journal:
 
 
 def read_commit(folder: Path) -> Commit | None:
-    """Returns what the run folder's writer last committed, None before its first commit or status.
+    """Return what the run folder's writer last committed, None before its first commit or status.
 
     Raises:
         JournalError: on a file that no writer left so; without it the whole journal is a new run to its readers.
@@ -315,7 +298,7 @@ def read_commit(folder: Path) -> Commit | None:
 
 
 def has_lost_commit(folder: Path) -> bool:
-    """Returns whether a run folder's journal holds something that once counted and no `commit.json` speaks for.
+    """Tell whether a run folder's journal holds something that once counted, but `commit.json` is gone.
 
     Raises:
         JournalError: on a folder whose `commit.json` is damaged.
@@ -326,7 +309,7 @@ def has_lost_commit(folder: Path) -> bool:
 
 
 def commit_of(content: bytes) -> Commit:
-    """Returns the commit that the bytes of a `commit.json` say. Raises: JournalError."""
+    """Return the commit in the bytes of a `commit.json`. Raises: JournalError."""
     try:
         return schema_of(Commit).validate_json(content, strict=True)
     except ValidationError:
@@ -334,17 +317,17 @@ def commit_of(content: bytes) -> Commit:
 
 
 def commit_bytes(commit: Commit) -> bytes:
-    """Returns the `commit.json` of a commit."""
+    """Return the bytes of a commit's `commit.json`."""
     return _encode(asdict(commit)).encode()
 
 
 def model_file(name: str, step: int) -> str:
-    """The artifact with the weights of a model at a step."""
+    """Return the artifact's name of a model's weights at a step."""
     return f"models/{name}/{step}.safetensors"
 
 
 def adopt(folder: Path, parent: Path) -> None:
-    """Puts a run, which may have yet to start, under another one; nobody may be writing its folder.
+    """Put a run, which may have yet to start, under another one; nobody may be writing its folder.
 
     Raises:
         JournalError: on a folder whose `commit.json` is damaged.
@@ -356,41 +339,19 @@ def adopt(folder: Path, parent: Path) -> None:
         _write_commit(folder, adopted)
 
 
-def fitted(lines: Sequence[str], room: int, rest: str) -> str:
-    """Returns as many lines as have room, in characters, in a note, and after them how many more are in `rest`."""
-    text = "\n".join(lines)
-    if len(text) <= room:
-        return text
-    more = f"\n\n... and {{:,}} more in {rest}."
-    kept = sum(end <= room - len(more) - 5 for end in accumulate(len(line) + 1 for line in lines))
-    return "\n".join(lines[:kept]) + more.format(len(lines) - kept)
-
-
-def restore(folder: Path, start: int, pieces: Iterable[bytes]) -> None:
-    """Continues a run folder's journal from an offset with bytes of another copy of it; `commit.json` makes them count.
-
-    The caller holds the folder, and what is committed in it ends at `start` or before.
-
-    Raises:
-        JournalError: on a journal that ends before `start`.
-    """
-    make_folder(folder)
-    _write_from(folder, start, pieces)
-
-
-def _write_from(folder: Path, start: int, pieces: Iterable[bytes]) -> None:
-    """Puts bytes, durably, in the place of all that a journal holds behind an offset. Raises: JournalError, OSError."""
+def _write_from(folder: Path, start: int, content: bytes) -> None:
+    """Replace all after an offset of a journal by other bytes, durably. Raises: JournalError, OSError."""
     with open(folder / "journal.jsonl", "ab", opener=no_link) as file:
         if os.fstat(file.fileno()).st_size < start:  # truncating would fill the gap with zeros
             raise JournalError(f"{file.name} is shorter than its writer left it: it was cut or replaced since")
         file.truncate(start)
-        file.writelines(pieces)
+        file.write(content)
         file.flush()
         os.fsync(file.fileno())
 
 
 def read(folder: Path, start: int = 0, end: int | None = None) -> Iterator[tuple[int, Record]]:
-    """Yields the committed records between two offsets, each with the offset where it ends.
+    """Yield the committed records between two offsets, each with the offset where it ends.
 
     Args:
         start: bytes; where a record begins.
@@ -416,16 +377,16 @@ def read(folder: Path, start: int = 0, end: int | None = None) -> Iterator[tuple
 
 
 def record_of(line: bytes, where: str) -> Record:
-    """The record that a line of a journal holds. Raises: ValueError, saying where."""
+    """Return the record in a line of a journal. Raises: ValueError, saying where."""
     try:
         fields = read_object(line)
         return schema_of(_KINDS[fields.pop("kind")]).validate_python(fields)
     except (ValueError, KeyError, TypeError):  # among them pydantic's, of several lines
-        raise ValueError(f"{where}: no record of a journal: {line[:60]!r}") from None
+        raise ValueError(f"{where}: not a record of a journal: {line[:60]!r}") from None
 
 
 def curve(folder: Path, keys: Sequence[str], points: int = 500) -> Iterator[Metrics]:
-    """Yields the committed metrics that hold all of some keys, of a long journal about `points` of them.
+    """Yield the committed metrics that hold all of some keys, of a long journal about `points` of them.
 
     A journal of over 2,000 bytes a point is cut into as many stretches of equal length, and the first in each is taken;
     the first and the last of all are always among them. So a history's length costs nothing.
@@ -453,7 +414,7 @@ def curve(folder: Path, keys: Sequence[str], points: int = 500) -> Iterator[Metr
 
 
 def _points(file: BinaryIO, keys: Sequence[str], start: int, stop: int) -> Iterator[tuple[int, Metrics]]:
-    """Yields the metrics of all keys whose lines begin between two offsets, each with the offset where it ends."""
+    """Yield the metrics of all keys whose lines begin between two offsets, each with the offset where it ends."""
     kind, wanted = b'{"kind":"metrics",', [f"{_encode(key)}:".encode() for key in keys]
     file.seek(max(start - 1, 0))
     position = start if start == 0 else start - 1 + len(file.readline(SMALL))  # a line's beginning
@@ -467,7 +428,7 @@ def _points(file: BinaryIO, keys: Sequence[str], start: int, stop: int) -> Itera
 
 
 def _line(file: BinaryIO, start: int, end: int) -> bytes:
-    """The line that begins where the file is read. Raises: ValueError where it has no end."""
+    """Read the line that begins at `start`. Raises: ValueError if it has no end."""
     line = file.readline(SMALL)
     if line.endswith(b"\n"):
         return line

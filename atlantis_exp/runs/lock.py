@@ -1,4 +1,4 @@
-"""Who holds a folder: one process at a time, until it ends, however it does."""
+"""Hold a folder: one process at a time, until it ends, however it does."""
 
 import fcntl
 import os
@@ -11,16 +11,17 @@ from filelock import FileLock, Timeout
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import SMALL, make_folder, no_link, open_file, read_file
 
-_HOLDER = "holder.txt"  # not the lock itself, which is emptied by whoever asks for it
+_HOLDER = "holder.txt"  # not the lock itself, which is emptied when it is asked for
 _OF_OPTUNA = "trials.jsonl.lock"  # a link while a process writes
 
 
 @contextmanager
 def held(folder: Path, name: str, seconds: float) -> Iterator[None]:
-    """Hold a folder, which is made if need be, after waiting for it as long as that.
+    """Hold a folder, made if need be, for the block; wait up to so many seconds for it.
 
     Raises:
-        Fault: naming the process that holds it, exit code 75; or a link, through which something else would be written.
+        Fault: naming the process that holds it, exit code 75; or a symbolic link, through which another file would be
+            written.
     """
     if (link := _link(folder)) is not None:
         raise Fault(f"{name}: {link} is a link, which is not written through; put what it leads to in its place")
@@ -43,14 +44,14 @@ def _holder(folder: Path) -> str:
 
 
 def _link(folder: Path) -> Path | None:
-    """A folder itself or what is in it, if that is a symbolic link other than Optuna's lock of a search."""
+    """Find a symbolic link: the folder itself or one in it, other than Optuna's lock of a search."""
     places = (Path(above, name) for above, folders, files in os.walk(folder) for name in (*folders, *files))
     links = (path for path in (folder, *places) if path.is_symlink())
     return next((link for link in links if link != folder / _OF_OPTUNA), None)
 
 
 def is_held(folder: Path) -> bool:
-    """Whether a process holds a folder, which may be one that is only to be read. Raises: OSError."""
+    """Tell whether a process holds a folder, which may be read-only. Raises: OSError."""
     try:
         with open_file(folder / "lock") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # until it is closed

@@ -17,7 +17,8 @@ from atlantis_exp.build import build_network_actor, described
 from atlantis_exp.checking import nearest, parse, to_dict
 from atlantis_exp.config import STRICT, Config, EvaluationConfig, PathsConfig
 from atlantis_exp.faults import ConfigError, Fault
-from atlantis_exp.runs.files import ARTIFACT, SMALL, read_file, read_object
+from atlantis_exp.runs.files import ARTIFACT, SMALL, read_file, read_object, write_file
+from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.statistics import interval, resample, summarize
 from atlantis_exp.training.actor import Actor
 from atlantis_exp.training.evaluation import Evaluation
@@ -26,11 +27,12 @@ SINGLE = 8_000_000  # bytes; larger weights are handed on in half precision, sin
 
 _COLUMNS = ("mean", "95 % interval", "median", "IQM", "high", "low", "episodes", "epsilon", "seed")
 _RESAMPLES = 10_000  # bootstrap samples
+_RESAMPLED = 10_000  # episodes at most
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class Card:
-    """What is said of exported weights: which training they are of, and what they score."""
+    """Which training exported weights are of, and what they score."""
 
     format: Literal[1]
     run: str
@@ -42,18 +44,18 @@ class Card:
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]  # of weights.safetensors
     config: Config
     evaluation: EvaluationConfig  # that gave the scores
-    scores: Annotated[list[float], Field(min_length=1)]  # an episode
+    scores: Annotated[list[Annotated[float, Field(ge=-1e15, le=1e15)]], Field(min_length=1, max_length=10**6)]
 
 
 def read_card(folder: Path) -> tuple[Card, bytes]:
-    """A folder's card, and its weights as safetensors.
+    """Read a folder's card, and its weights as safetensors.
 
     Raises:
-        ConfigError: without such a folder, or with a card that is none.
-        Fault: where the weights are not the card's.
+        ConfigError: no such folder, or not a card in it.
+        Fault: the weights are not the card's.
     """
     path = folder / "card.json"  # may be a link, as in a cache of downloads: somebody named this very folder
-    if not path.is_file():
+    if not path.exists():
         others = {str(card.parent) for card in folder.parent.glob("*/card.json")}
         raise ConfigError(
             f"weights={folder}: no folder with a card.json; {nearest(str(folder), {'latest', 'best'} | others)}"
@@ -61,7 +63,7 @@ def read_card(folder: Path) -> tuple[Card, bytes]:
     try:
         card = parse(Card, read_object(read_file(path.resolve(), SMALL)))
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: {error}") from None
+        raise ConfigError(f"weights={folder}: card.json: {error}") from None
     try:
         weights = read_file((folder / "weights.safetensors").resolve(), ARTIFACT)
     except (OSError, ValueError) as error:
@@ -71,23 +73,28 @@ def read_card(folder: Path) -> tuple[Card, bytes]:
     return card, weights
 
 
-def write_card(folder: Path, card: Card, weights: bytes, evaluation: Evaluation, onnx: bytes | None = None) -> None:
-    """Fill a folder with the weights, their card, and the page that says the same to people and to model hubs."""
-    (folder / "weights.safetensors").write_bytes(weights)
+def write_card(
+    folder: Path, shown: Path, card: Card, weights: bytes, evaluation: Evaluation, onnx: bytes | None = None
+) -> None:
+    """Fill a folder, which people will find as `shown`, with weights, their card, and a page for people and model hubs.
+
+    Raises: OSError.
+    """
+    write_file(folder / "weights.safetensors", weights)
     files = f"`weights.safetensors`: {len(weights):,} bytes, {card.precision}, sha256 `{card.sha256}`."
     if onnx is not None:
-        (folder / "network.onnx").write_bytes(onnx)
+        write_file(folder / "network.onnx", onnx)
         env = card.config.env
         files += (
             f"\n\n`network.onnx`: {len(onnx):,} bytes, float32: `states`, uint8 (batch, {env.stack}, {env.size}, "
             f"{env.size}), to `q_values`, float32 (batch, actions)."
         )
-    (folder / "README.md").write_text(_page(folder, card, files, evaluation))
-    (folder / "card.json").write_text(json.dumps(to_dict(card), indent=2) + "\n")
+    write_file(folder / "README.md", _page(shown, card, files, evaluation).encode())
+    write_file(folder / "card.json", (json.dumps(to_dict(card), indent=2) + "\n").encode())
 
 
 def pack(weights: bytes) -> tuple[bytes, Literal["float32", "float16"]]:
-    """Weights as safetensors, in half precision where they take more than `SINGLE`."""
+    """Return weights as safetensors, in half precision if they take more than `SINGLE`."""
     if len(weights) <= SINGLE:
         return weights, "float32"
     arrays = safetensors.numpy.load(weights)
@@ -96,7 +103,7 @@ def pack(weights: bytes) -> tuple[bytes, Literal["float32", "float16"]]:
 
 
 def portable(config: Config) -> Config:
-    """A config without what is its machine's alone: processes, devices, places and servers."""
+    """Return a config without its machine's processes, devices, places and servers."""
     begun = config.training.pinned
     return replace(
         config,
@@ -112,16 +119,17 @@ def portable(config: Config) -> Config:
 
 
 def build_exported_actor(config: Config, weights: bytes, device: str) -> Actor:
-    """The player of exported weights; in float32 and on one thread, since rounding depends on how a batch is cut.
+    """Build the player of exported weights; in float32 on one thread, since rounding depends on how a batch is cut.
 
     Raises: Fault.
     """
     exact = replace(config, threads=1, training=replace(config.training, precision="fp32"))
+    set_up_torch(exact, device)
     return build_network_actor(exact, weights, device)
 
 
 def side_by_side(card: Card, settings: EvaluationConfig, scores: Sequence[float]) -> Table:
-    """The card's scores, and those that were played with these settings."""
+    """Tabulate the card's scores above those that were played with these settings."""
     table = Table("", *_COLUMNS)
     for column in table.columns[1:]:
         column.justify = "right"
@@ -131,10 +139,12 @@ def side_by_side(card: Card, settings: EvaluationConfig, scores: Sequence[float]
 
 
 def _points(settings: EvaluationConfig, scores: Sequence[float]) -> Iterator[str]:
-    """What `_COLUMNS` name; the interval is of the mean, over episodes."""
+    """Yield the cells of `_COLUMNS`; the interval is of the mean, over episodes."""
     summary = summarize(scores)
-    samples = resample([np.array(scores)], _RESAMPLES, np.random.default_rng(0))
-    low, high = interval([float(sample.mean()) for sample in samples])
+    low, high = summary.mean - 1.96 * summary.standard_error, summary.mean + 1.96 * summary.standard_error
+    if len(scores) <= _RESAMPLED:  # of more, the bootstrap takes minutes to say the same
+        samples = resample([np.array(scores)], _RESAMPLES, np.random.default_rng(0))
+        low, high = interval([float(sample.mean()) for sample in samples])
     yield f"{summary.mean:,.0f}"
     yield f"{low:,.0f} to {high:,.0f}"
     yield from (f"{point:,.0f}" for point in (summary.median, summary.interquartile_mean, summary.high, summary.low))
@@ -142,7 +152,7 @@ def _points(settings: EvaluationConfig, scores: Sequence[float]) -> Iterator[str
 
 
 def metadata(name: str, card: Card) -> str:
-    """The YAML that model hubs read at the top of a page; each value as JSON, which is YAML, too."""
+    """Return the YAML that model hubs read at the top of a page; each value as JSON, which is YAML, too."""
     game = card.config.env.id.rsplit("/")[-1]
     reward = f"{np.mean(card.scores):.2f} +/- {np.std(card.scores):.2f}"
     task = {"type": "reinforcement-learning", "name": "reinforcement-learning"}

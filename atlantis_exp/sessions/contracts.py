@@ -1,10 +1,9 @@
-"""Does a component keep what the rest relies on? Each promise tried on it, then what it costs, and what ours do."""
+"""The verb `check`: tries each contract on the components that are named, then measures their cost beside ours."""
 
 import copy
 import random
 import tempfile
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -17,8 +16,8 @@ from rich.table import Table
 from torch import nn
 
 from atlantis_exp import terminal
-from atlantis_exp.build import build_component, build_learner, build_trainer, import_components, make_emulator
-from atlantis_exp.config import Config
+from atlantis_exp.build import build_component, build_trainer, import_components, make_emulator
+from atlantis_exp.config import Config, SamplerConfig
 from atlantis_exp.faults import Fault
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.learning.objectives import DQN, Quantile
@@ -28,11 +27,15 @@ from atlantis_exp.networks.sizes import count_parameters
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.sessions.training import expected
 from atlantis_exp.sessions.verifying import fingerprints, train_and_kill
 from atlantis_exp.training.checkpoint import to_safetensors
 from atlantis_exp.training.plan import Counters
 from atlantis_exp.training.progress import Progress
+
+Trial = tuple[str, str, Callable[[], object]]
+"""A component, its contract, and the call that raises where the contract is broken."""
 
 _SIDES = (84, 159)  # pixels
 _ACTIONS = 4
@@ -42,21 +45,16 @@ _HEADS: dict[str, Head] = {
     "dueling": DuelingHead,
     "quantile": partial(QuantileHead, quantiles=_QUANTILES),
 }
-_SECONDS = 1.0  # of a measurement
 
 
-def check(job: Job, small: Job, references: Sequence[Job]) -> None:
-    """Try every contract on the components of a job and, where all are kept, measure its network and the references'.
-
-    small: the same components in a training of seconds, which is killed and continued.
+def check(trials: Iterator[Trial], measured: Mapping[str, Job]) -> None:
+    """Try every contract and, where all are kept, measure what trainings cost, each under its name.
 
     Raises:
         Fault: where a contract is broken.
     """
-    config = job.config
-    import_components(config)
     table, broken = Table("component", "contract", "", "because"), []
-    for part, contract, trial in trials(config, small):
+    for part, contract, trial in trials:
         try:
             with terminal.working(f"{part}: {contract}"):
                 trial()
@@ -69,36 +67,44 @@ def check(job: Job, small: Job, references: Sequence[Job]) -> None:
     terminal.console(least=120).print(table)
     if broken:
         raise Fault(f"broken: {', '.join(broken)}")
-    with terminal.working("measuring what the networks cost"):
-        costs = _costs([job, *references])
-    terminal.console(least=120).print(costs)
+    if measured:
+        with terminal.working("measuring costs"):
+            costs = _costs(measured)
+        terminal.console(least=120).print(costs)
 
 
-def trials(config: Config, small: Job) -> Iterator[tuple[str, str, Callable[[], None]]]:
-    """Every contract of a config's components: of what, what, and the call that raises where it is broken."""
-    network, objective = f"model={config.model.name}", f"objective={config.objective.name}"
-    for side in _SIDES:
-        for head in _HEADS:
-            for precision in ("fp32", "bf16"):
-                yield (
-                    network,
-                    f"learns: {head}, {side} pixels, {precision}",
-                    partial(_learns, config, head, side, precision),
-                )
-    yield network, "the same seed, the same weights", partial(_same_weights, config)
-    yield network, "weights there and back, on meta too", partial(_there_and_back, config)
-    yield network, "draws from no global stream", partial(_network_draws_nothing, config)
-    if config.model.component is not None and config.model.component.facts["splits_batches"]:
-        yield network, "a batch in parts is the batch", partial(_splits, config)
-    yield objective, "targets and losses a sample, finite", partial(_objective_is_whole, config)
-    yield objective, "discount 0: rewards alone", partial(_objective_ends, config)
-    for phase, described in config.phase.items():
-        sampler = f"sampler={described.sampler}"
-        yield sampler, "a batch of what there is", partial(_draws, config, phase)
-        yield sampler, "state there and back", partial(_sampler_continues, config, phase)
-    yield f"epsilon={config.epsilon.name}", "in [0, 1], before and past the end", partial(_epsilon_holds, config)
-    yield f"lr_schedule={config.lr_schedule.name}", "finite, not negative", partial(_rate_holds, config)
-    yield f"env.id={config.env.id}", "actions are ALE's, points sum to rewards", partial(_pays, config)
+def trials(config: Config, small: Job, kinds: Collection[str]) -> Iterator[Trial]:
+    """Return every contract of a config's components of these kinds.
+
+    small: the same components in a training of seconds, which is killed and continued.
+    """
+    import_components(config)
+    if "model" in kinds:
+        network = f"model={config.model.name}"
+        for side in _SIDES:
+            for head in _HEADS:
+                for precision in ("fp32", "bf16"):
+                    trial = partial(_learns, config, head, side, precision)
+                    yield network, f"learns: {head}, {side} pixels, {precision}", trial
+        yield network, "the same seed, the same weights", partial(_same_weights, config)
+        yield network, "weights there and back, on meta too", partial(_weights_return, config)
+        yield network, "draws from no global stream", partial(_network_draws_nothing, config)
+        if config.model.component is not None and config.model.component.facts["splits_batches"]:
+            yield network, "a batch in parts is the batch", partial(_splits, config)
+    if "objective" in kinds:
+        objective = f"objective={config.objective.name}"
+        yield objective, "targets and losses a sample, finite", partial(_objective_is_whole, config)
+        yield objective, "discount 0: rewards alone", partial(_objective_ends, config)
+    if "sampler" in kinds:
+        for name, part in {part.name: part for part in map(config.sampler_of, config.phase)}.items():
+            yield f"sampler={name}", "a batch of available transitions", partial(_draws, config, part)
+            yield f"sampler={name}", "state there and back", partial(_sampler_continues, config, part)
+    if "epsilon" in kinds:
+        yield f"epsilon={config.epsilon.name}", "in [0, 1], before and past the end", partial(_epsilon_holds, config)
+    if "lr_schedule" in kinds:
+        yield f"lr_schedule={config.lr_schedule.name}", "finite, not negative", partial(_rate_holds, config)
+    if "env" in kinds:
+        yield f"env.id={config.env.id}", "actions are ALE's, points sum to rewards", partial(_pays, config)
     yield "all", "killed and continued is unbroken, bit for bit", partial(_resumes, small)
 
 
@@ -115,6 +121,11 @@ def _made(config: Config, side: int, head: str = "plain", seed: int = 0) -> nn.M
     return made
 
 
+def _states(config: Config, count: int) -> torch.Tensor:
+    side = config.env.size
+    return torch.rand(count, config.env.stack, side, side, generator=torch.Generator().manual_seed(0))
+
+
 def _learns(config: Config, head: str, side: int, precision: Any) -> None:
     network, target = _made(config, side, head), _made(config, side, head)
     objective = Quantile(_QUANTILES) if head == "quantile" else DQN()
@@ -126,31 +137,28 @@ def _learns(config: Config, head: str, side: int, precision: Any) -> None:
     before = copy.deepcopy(network.state_dict())
     rewards = np.arange(6, dtype=np.float32)
     errors = learner.update(states, np.arange(6) % _ACTIONS, rewards, states, np.full(6, 0.9, np.float32))
+    after = network.state_dict()
     _hold(errors.isfinite().all(), "an error is not finite")
-    _hold(all(value.isfinite().all() for value in network.state_dict().values()), "a weight is not finite")
-    unmoved = [name for name, _ in network.named_parameters() if torch.equal(before[name], network.state_dict()[name])]
-    _hold(len(unmoved) < len([*network.parameters()]), "no weight has moved")
+    _hold(all(value.isfinite().all() for value in after.values()), "a weight is not finite")
+    _hold(any(not torch.equal(before[name], after[name]) for name, _ in network.named_parameters()), "no weight moved")
 
 
 def _same_weights(config: Config) -> None:
-    torch.testing.assert_close(
-        _made(config, _side(config)).state_dict(), _made(config, _side(config)).state_dict(), rtol=0, atol=0
-    )
+    one, other = (_made(config, config.env.size).state_dict() for _ in range(2))
+    torch.testing.assert_close(one, other, rtol=0, atol=0)
 
 
-def _there_and_back(config: Config) -> None:
-    side = _side(config)
-    stored = safetensors.torch.load(to_safetensors(_made(config, side, seed=1).state_dict()))
+def _weights_return(config: Config) -> None:
+    side = config.env.size
+    network, other = _made(config, side, seed=1), _made(config, side)
+    stored = safetensors.torch.load(to_safetensors(network.state_dict()))
     with torch.device("meta"):
-        build_component(config, config.model, (config.env.stack, side, side), _ACTIONS, nn.Linear).load_state_dict(
-            stored, assign=True
-        )
-    other = _made(config, side)
+        shape = config.env.stack, side, side
+        build_component(config, config.model, shape, _ACTIONS, nn.Linear).load_state_dict(stored, assign=True)
     other.load_state_dict(stored)
-    states = torch.rand(2, config.env.stack, side, side)
+    states = _states(config, 2)
     with torch.no_grad():
-        expected_values, values = (each.eval()(states) for each in (_made(config, side, seed=1), other))
-    torch.testing.assert_close(values, expected_values, rtol=0, atol=0)
+        torch.testing.assert_close(other.eval()(states), network.eval()(states), rtol=0, atol=0)
 
 
 @contextmanager
@@ -166,16 +174,15 @@ def _no_global_stream() -> Iterator[None]:
 
 
 def _network_draws_nothing(config: Config) -> None:
-    network, states = _made(config, _side(config)), torch.zeros(2, config.env.stack, _side(config), _side(config))
+    network, states = _made(config, config.env.size), _states(config, 2)
     with _no_global_stream():
         network.train()(states).sum().backward()
         network.eval()(states)
 
 
 def _splits(config: Config) -> None:
-    side = _side(config)
-    states = torch.rand(6, config.env.stack, side, side, generator=torch.Generator().manual_seed(0))
-    whole, parted = (copy.deepcopy(_made(config, side)).train() for _ in range(2))
+    states = _states(config, 6)
+    whole, parted = (_made(config, config.env.size).train() for _ in range(2))
     torch.testing.assert_close(torch.cat([parted(states[:2]), parted(states[2:])]), whole(states), rtol=1e-4, atol=1e-5)
 
 
@@ -185,14 +192,22 @@ def _values(config: Config, seed: int) -> torch.Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(seed))
 
 
+def _targets(config: Config, discount: float, seed: int) -> torch.Tensor:
+    targets: torch.Tensor = build_component(config, config.objective).targets(
+        torch.arange(6.0),
+        torch.arange(6),
+        torch.full((6,), discount),
+        lambda _: _values(config, seed),
+        lambda _: _values(config, seed + 9),
+    )
+    return targets
+
+
 def _objective_is_whole(config: Config) -> None:
-    objective, actions, ones = build_component(config, config.objective), torch.arange(6) % _ACTIONS, torch.ones(6)
     q = _values(config, 0).requires_grad_()
     with _no_global_stream():
-        target = objective.targets(
-            ones, torch.arange(6), 0.9 * ones, lambda _: _values(config, 1), lambda _: _values(config, 2)
-        )
-        losses = objective.losses(q, actions, target)
+        target = _targets(config, 0.9, 1)
+        losses = build_component(config, config.objective).losses(q, torch.arange(6) % _ACTIONS, target)
         losses.mean().backward()
     _hold(target.shape == (6, *q.shape[2:]), f"targets of shape {tuple(target.shape)}")
     _hold(losses.shape == (6,), f"losses of shape {tuple(losses.shape)}")
@@ -201,18 +216,7 @@ def _objective_is_whole(config: Config) -> None:
 
 
 def _objective_ends(config: Config) -> None:
-    objective, rewards = build_component(config, config.objective), torch.arange(6.0)
-    targets = [
-        objective.targets(
-            rewards,
-            torch.arange(6),
-            torch.zeros(6),
-            lambda _, s=seed: _values(config, s),
-            lambda _, s=seed: _values(config, s + 9),
-        )
-        for seed in (1, 2)
-    ]
-    torch.testing.assert_close(*targets)
+    torch.testing.assert_close(_targets(config, 0.0, 1), _targets(config, 0.0, 2))
 
 
 def _memory() -> ReplayMemory:
@@ -223,8 +227,8 @@ def _memory() -> ReplayMemory:
     return memory
 
 
-def _draws(config: Config, phase: str) -> None:
-    memory, sampler = _memory(), build_component(config, config.sampler_of(phase))
+def _draws(config: Config, part: SamplerConfig) -> None:
+    memory, sampler = _memory(), build_component(config, part)
     with _no_global_stream():
         drawn = sampler.sample(memory, 16, np.random.default_rng(0))
         if drawn.weights is not None:
@@ -233,9 +237,9 @@ def _draws(config: Config, phase: str) -> None:
     _hold(memory.available(drawn.ids).all(), "a transition that is not available")
 
 
-def _sampler_continues(config: Config, phase: str) -> None:
+def _sampler_continues(config: Config, part: SamplerConfig) -> None:
     memory = _memory()
-    sampler, other = (build_component(config, config.sampler_of(phase)) for _ in range(2))
+    sampler, other = (build_component(config, part) for _ in range(2))
     rng = np.random.default_rng(0)
     for _ in range(3):
         drawn = sampler.sample(memory, 8, rng)
@@ -283,31 +287,21 @@ def _resumes(small: Job) -> None:
     _hold(whole == killed, f"{', '.join(part for part in whole if whole[part] != killed[part])} differ")
 
 
-def _costs(jobs: Sequence[Job]) -> Table:
-    """What networks cost here, as their jobs would train them."""
-    table = Table("network", "pixels", "parameters", "FLOPs a sample", "updates/s", "steps/s")
+def _costs(jobs: Mapping[str, Job]) -> Table:
+    """Measure trainings on this machine; an update includes drawing its batch."""
+    table = Table("component", "pixels", "parameters", "FLOPs a sample", "updates/s", "steps/s")
     for column in table.columns[1:]:
         column.justify = "right"
-    for job in jobs:
+    for name, job in jobs.items():
         config = job.config
-        learner, size, stack = build_learner(config), config.env.size, config.env.stack
-        batch = config.training.batch_size
-        states = np.random.default_rng(0).integers(0, 256, (batch, stack, size, size), np.uint8)
-        numbers = np.zeros(batch, np.float32)
-        flops = learner.update_flops((stack, size, size), batch) / batch
-        updates, started = 0, time.perf_counter()
-        while (passed := time.perf_counter() - started) < _SECONDS or updates < 2:
-            learner.update(states, np.zeros(batch, np.int64), numbers, states, numbers).cpu()
-            updates += 1
+        set_up_torch(config, config.device)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder)
-            trainer = build_trainer(config, path, Journal(path), Progress(terminal.console()))
+            trainer = build_trainer(config, job.machine.cores, path, Journal(path), Progress(terminal.console()))
             with trainer.emulators:
-                steps = expected(trainer, config, Counters()).steps_per_second
-        counts = f"{count_parameters(learner.network):,}", f"{flops / 1e6:,.0f} M"
-        table.add_row(config.model.name, str(size), *counts, f"{updates / passed:,.1f}", f"{steps:,.0f}")
+                speed = expected(trainer, config, Counters())
+        size, batch = config.env.size, config.training.batch_size
+        flops = trainer.learner.update_flops((config.env.stack, size, size), batch) / batch
+        counts = f"{count_parameters(trainer.learner.network):,}", f"{flops / 1e6:,.0f} M"
+        table.add_row(name, str(size), *counts, f"{speed.updates_per_second:,.1f}", f"{speed.steps_per_second:,.0f}")
     return table
-
-
-def _side(config: Config) -> int:
-    return config.env.size

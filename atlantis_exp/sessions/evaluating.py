@@ -1,4 +1,4 @@
-"""Any player played, its report printed, and the evaluation kept as a run of its own."""
+"""Let any player play, print its report, and keep the evaluation as a run of its own."""
 
 import re
 import shutil
@@ -27,6 +27,7 @@ from atlantis_exp.runs.folder import BEST_EPISODE, EVALUATION, EVALUATION_REPORT
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.cards import build_exported_actor, read_card, side_by_side
 from atlantis_exp.sessions.job import config_colour, labels
+from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.sessions.weights import stored_weights
 from atlantis_exp.sessions.window import Window
 from atlantis_exp.tracking.publishing import catch_up, publishing
@@ -48,6 +49,7 @@ def evaluate(
     paths: PathsConfig,
     asked: Collection[str],
     command: str,
+    cores: int,
 ) -> None:
     """Play a network on its own environment, print the report's table, and record it among the runs.
 
@@ -60,6 +62,7 @@ def evaluate(
         folder = find_run(outputs, run)
         name, title, trained, source = folder.name, folder.title, folder.trained_config, {"run": folder.name}
         stored, step = stored_weights(folder, weights)
+        set_up_torch(trained, device)
         actor = build_network_actor(trained, stored, device)
     else:
         if "run" in asked:
@@ -81,7 +84,7 @@ def evaluate(
     recorded = RunFolder(outputs / "evaluations" / f"{_placeable(name)}-at-{step}-{digest(facts)[:6]}")
     shown = labels(f"evaluation of {title} at {step} {digest(facts)[:6]}", config_colour(trained), "evaluation")
     with _held(recorded):
-        played = _play(f"{name} at step {step:,}", actor, trained.env, evaluation)
+        played = _play(f"{name} at step {step:,}", actor, trained.env, evaluation, cores)
         _record(recorded, facts, played, tracking, outputs, shown, command)
     if card:
         table = side_by_side(card, evaluation, [episode.score for episode in played[0].episodes])
@@ -104,21 +107,17 @@ def play_baseline(
     name: str,
     title: str,
     command: str,
+    cores: int,
 ) -> None:
     """Let a player without a network play, print the report's table, and record it all as the run `name`."""
     outputs = Path(paths.outputs)
     catch_up(outputs, tracking.uri)
-    facts = {
-        **({"plugins": {key: to_dict(each) for key, each in plugins.items()}} if plugins else {}),
-        "agent": to_dict(agent),
-        "env": to_dict(env),
-        "evaluation": to_dict(evaluation),
-        "tracking": to_dict(tracking),
-        "paths": to_dict(paths),
-    }
+    facts = _facts(agent=agent, env=env, evaluation=evaluation, tracking=tracking, paths=paths)
+    if plugins:
+        facts = {"plugins": _facts(**plugins), **facts}
     folder, shown = RunFolder(outputs / "runs" / name), labels(title, run_colour(agent.name), "baseline")
     with _held(folder):
-        played = _play(f"{agent.name} player on {env.id}", build_baseline(agent, env), env, evaluation)
+        played = _play(f"{agent.name} player on {env.id}", build_baseline(agent, env), env, evaluation, cores)
         _record(folder, facts, played, tracking, outputs, shown, command)
 
 
@@ -131,6 +130,7 @@ def play(
     tracking: TrackingConfig,
     paths: PathsConfig,
     command: str,
+    cores: int,
 ) -> None:
     """Let a person play, print the report's table, and record it all.
 
@@ -142,20 +142,14 @@ def play(
     folder = RunFolder(next(path for name in names if not (path := outputs / "runs" / name).exists()))
     low, high = (env.frameskip, env.frameskip + 1) if isinstance(env.frameskip, int) else env.frameskip
     game, progress = facts_of(env.game), Progress()
-    facts = {
-        "player": player,
-        "scale": scale,
-        "env": to_dict(env),
-        "evaluation": to_dict(evaluation),
-        "tracking": to_dict(tracking),
-        "paths": to_dict(paths),
-    }
+    settings = _facts(env=env, evaluation=evaluation, tracking=tracking, paths=paths)
+    facts = {"player": player, "scale": scale, **settings}
     shown = labels(folder.name, run_colour("human"), "human")
     with _held(folder):
         progress.say(f"{player} plays {env.title}: {game.keys_in_words}")
         window = Window(env.title, game, 60 / ((low + high - 1) / 2), scale)  # steps a second, on average
         actor, emulators = build_person(env, window.choose)
-        evaluator = build_evaluator(env, evaluation)
+        evaluator = build_evaluator(env, evaluation, cores)
         try:
             played = evaluator(actor, evaluation.episodes, progress, lambda: window.closed, emulators)
         except Stopped:
@@ -163,6 +157,10 @@ def play(
         finally:
             window.close()
         _record(folder, facts, (played, evaluator.film(played, progress)), tracking, outputs, shown, command)
+
+
+def _facts(**parts: Any) -> dict[str, Any]:
+    return {name: to_dict(part) for name, part in parts.items()}
 
 
 @contextmanager
@@ -177,10 +175,12 @@ def _held(folder: RunFolder) -> Iterator[None]:
                 shutil.rmtree(folder.path)
 
 
-def _play(what: str, actor: Actor, env: EnvConfig, evaluation: EvaluationConfig) -> tuple[Evaluation, bytes | None]:
+def _play(
+    what: str, actor: Actor, env: EnvConfig, evaluation: EvaluationConfig, cores: int
+) -> tuple[Evaluation, bytes | None]:
     progress = Progress()
     progress.say(f"{what}: {evaluation.episodes} episodes, epsilon {evaluation.epsilon}")
-    evaluator = build_evaluator(env, evaluation)
+    evaluator = build_evaluator(env, evaluation, cores)
     played = evaluator(actor, evaluation.episodes, progress)
     return played, evaluator.film(played, progress)
 

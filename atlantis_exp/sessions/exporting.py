@@ -1,7 +1,8 @@
-"""A stored run's network as a folder to hand on: played as it will be handed on, then written with its card."""
+"""Export a stored run's network as a folder: play it as it will be handed on, then write it with its card."""
 
 import hashlib
 import re
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -10,7 +11,8 @@ from atlantis_exp import terminal
 from atlantis_exp.build import build_evaluator
 from atlantis_exp.checking import check_new
 from atlantis_exp.config import EvaluationConfig, PathsConfig
-from atlantis_exp.runs.files import make_folder
+from atlantis_exp.faults import Fault
+from atlantis_exp.runs.files import whole
 from atlantis_exp.runs.folder import RunFolder, find_run
 from atlantis_exp.runs.journal import Metrics, Tags
 from atlantis_exp.sessions.cards import Card, build_exported_actor, pack, portable, write_card
@@ -30,10 +32,11 @@ def export(
     device: str,
     evaluation: EvaluationConfig,
     paths: PathsConfig,
+    cores: int,
 ) -> None:
-    """Play the network as it will be handed on, then write it with a card of how it was made and what it scored."""
+    """Play the network as it will be handed on, then write it with a card, all of it or nothing."""
     if onnx:
-        from atlantis_exp.sessions.onnx import export_onnx, require  # and scipy, a second that plain exports do without
+        from atlantis_exp.sessions.onnx import export_onnx, require
 
         require()
     outputs = Path(paths.outputs)
@@ -48,34 +51,37 @@ def export(
     actor = build_exported_actor(trained, packed, device)
     exported = None
     if onnx:
-        with terminal.working("writing the network as ONNX, and asking both about the same states"):
+        with terminal.working("writing the network as ONNX, and comparing it with torch"):
             exported = export_onnx(trained, packed)
-    make_folder(folder)  # before the episodes, lest there be no place for their scores
     settings = replace(evaluation, video=False, num_envs=evaluation.at_once)
     progress = Progress()
-    progress.say(f"{source.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
-    played = build_evaluator(trained.env, settings)(actor, settings.episodes, progress)
-    card = Card(
-        format=1,
-        run=source.name,
-        weights=weights,
-        step=step,
-        reached=reached,
-        made=made,
-        precision=precision,
-        sha256=hashlib.sha256(packed).hexdigest(),
-        config=trained,
-        evaluation=settings,
-        scores=[episode.score for episode in played.episodes],
-    )
-    write_card(folder, card, packed, played, exported and exported.content)
+    try:
+        with whole(folder) as place:  # before the episodes, lest there be no place for their scores
+            progress.say(f"{source.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
+            played = build_evaluator(trained.env, settings, cores)(actor, settings.episodes, progress)
+            card = Card(
+                format=1,
+                run=source.name,
+                weights=weights,
+                step=step,
+                reached=reached,
+                made=made,
+                precision=precision,
+                sha256=hashlib.sha256(packed).hexdigest(),
+                config=trained,
+                evaluation=settings,
+                scores=[episode.score for episode in played.episodes],
+            )
+            write_card(place, folder, card, packed, played, exported and exported.content)
+    except OSError as error:
+        raise Fault(f"to={folder}: {error}; nothing is written: make room there, or name another folder") from error
     print(f"\n{played.report()}\n\n{len(packed):,} bytes in {precision}, with card and scores, in {folder}")
     if exported:
         print(f"network.onnx: within {exported.difference:.1g} of torch's values in {exported.states} states")
 
 
 def _history(run: RunFolder, step: int) -> tuple[dict[str, float], dict[str, str]]:
-    """What a training had behind it at a step, and what made it. Raises: Fault, where its journal is damaged."""
+    """Return how far a training was at a step, and what made it. Raises: Fault if its journal is damaged."""
     reached: dict[str, float] = {}
     tags: dict[str, str] = {}
     for record in run.records():
@@ -84,7 +90,16 @@ def _history(run: RunFolder, step: int) -> tuple[dict[str, float], dict[str, str
         elif isinstance(record, Metrics) and record.values.keys() >= {*_COUNTERS} and record.step <= step:
             reached = {name.split("/")[1]: record.values[name] for name in _COUNTERS}
     made = {key: value for key, value in tags.items() if key.startswith(("command", "git.", "precision", "version."))}
-    if "command" in made:  # without the places of this machine
-        made["command"] = re.sub(r" (paths|tracking)\.\S+", "", made["command"])
-        made["command"] = re.sub(r"/[^,'\]\[]*/(?=\w+\.py\b)", "./", made["command"])  # of plugins
+    if "command" in made:
+        made["command"] = _without_places(made["command"])
     return reached, made
+
+
+def _without_places(command: str) -> str:
+    """Return a command without this machine's outputs and servers, other paths cut to their last part."""
+    try:
+        words = shlex.split(command)
+    except ValueError:  # not a shell's: forged
+        return ""
+    kept = (word for word in words if not re.match(r"[+~]*(paths|tracking)\.", word))
+    return shlex.join(re.sub(r"(?<![\w.])(~[^/]*|\.{0,2})/([^,'\[\]]*/)?", "./", word) for word in kept)

@@ -2,11 +2,13 @@
 
 import re
 import shlex
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
 
 from atlantis_exp.config import Config
+from atlantis_exp.machine import Machine, here
 from atlantis_exp.terminal import PROGRAM
 
 
@@ -17,7 +19,12 @@ class Job:
     config: Config
     words: tuple[str, ...] = ()  # what was asked for besides network, sampler and seed, in few words
     overrides: tuple[str, ...] = ()  # as typed, of this job alone
-    launcher: str | None = None  # of the sweep that this process does one job of, `apart` in a process of its own
+    machine: Machine = field(default_factory=here)
+
+    @property
+    def launcher(self) -> str | None:
+        """The launcher of the sweep that this process does one job of."""
+        return self.machine.launcher
 
     @property
     def command(self) -> str:
@@ -79,3 +86,13 @@ def config_colour(config: Config) -> str:
 def labels(title: str, colour: str, kind: str) -> dict[str, str]:
     """The tags by which MLflow shows a run, and tells trainings, sweeps, comparisons apart."""
     return {"mlflow.runName": title, "mlflow.runColor": colour, "atlantis.kind": kind}
+
+
+def fitted(lines: Sequence[str], room: int, rest: str) -> str:
+    """Return as many lines of a note as have room, in characters, then how many more are in `rest`."""
+    text = "\n".join(lines)
+    if len(text) <= room:
+        return text
+    more = f"\n\n... and {{:,}} more in {rest}."
+    kept = sum(end <= room - len(more) - 5 for end in accumulate(len(line) + 1 for line in lines))
+    return "\n".join(lines[:kept]) + more.format(len(lines) - kept)

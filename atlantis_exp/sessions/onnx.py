@@ -1,24 +1,24 @@
-"""A network as ONNX, for whoever plays without torch, asked about the same states as the one in torch."""
+"""Write a network as ONNX, to play without torch, and compare its values with torch's."""
 
 import logging
 import warnings
-from dataclasses import replace
 from importlib.util import find_spec
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from rich.text import Text
 from torch import nn
 
-from atlantis_exp.build import build_trained_network
+from atlantis_exp.build import build_trained_network, make_emulator
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
-from atlantis_exp.game.archive import read_archive
+from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.learning.objectives import action_values
 from atlantis_exp.learning.values import ActionValues
-from atlantis_exp.sessions.probing import Network, Values, asked
 
+Values = npt.NDArray[np.float32]  # (states, actions)
 _TOLERANCE = 1e-4  # of the largest value, between float32 in torch and in ONNX Runtime
 
 
@@ -48,12 +48,12 @@ def require() -> None:
 
 
 def export_onnx(config: Config, weights: bytes) -> Exported:
-    """A trained network as ONNX: `states`, uint8 (batch, stack, size, size), to `q_values`, float32 (batch, actions).
+    """Return a network as ONNX: `states`, uint8 (batch, stack, size, size), to `q_values`, float32 (batch, actions).
 
-    It is asked about the game's archived states, or about noise where a game has none.
+    Both are asked about the same states of a game.
 
     Raises:
-        Fault: where it cannot be written, or says something else than in torch.
+        Fault: it cannot be written, or its values are not torch's.
     """
     network = build_trained_network(config, weights).eval()
     shape = config.env.stack, config.env.size, config.env.size
@@ -74,7 +74,8 @@ def export_onnx(config: Config, weights: bytes) -> Exported:
         assert program is not None
         content: bytes = program.model_proto.SerializeToString()
     except torch.onnx.OnnxExporterError as error:
-        raise Fault(f"the network cannot be written as ONNX: {str(error).splitlines()[0]}") from error
+        reason = " ".join(Text.from_ansi(str(error)).plain.split())
+        raise Fault(f"the network cannot be written as ONNX: {reason}") from error
     finally:
         logging.disable(before)
     here, there = _both(config, network, content)
@@ -85,20 +86,13 @@ def export_onnx(config: Config, weights: bytes) -> Exported:
 
 
 def _both(config: Config, network: nn.Module, content: bytes) -> tuple[Values, Values]:
-    """The values of torch and of ONNX Runtime in the same states."""
+    """Return the values of torch and of ONNX Runtime in the states of a game that is played by chance."""
     import onnxruntime
 
+    env, emulator = config.env, make_emulator(config.env)()
+    stack = FrameStack(1, env.size, env.stack)
+    stack.reset([0], emulator.reset(0)[np.newaxis])
+    actions = np.random.default_rng(0).integers(len(emulator.game.actions), size=64).tolist()
+    states = np.concatenate([stack.push(emulator.step(action).observation[np.newaxis]) for action in actions])
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-
-    def q_values(states: npt.NDArray[np.uint8]) -> Values:
-        values: Values = session.run(None, {"states": states})[0]
-        return values
-
-    plain = Network("torch", "torch", config.env, ActionValues(network).q_values)
-    other = replace(plain, run="ONNX Runtime", q_values=q_values)
-    if (game := config.env.game) is not None and (path := game.data_path("states.npz")).is_file():
-        archive = read_archive(path)
-        return asked(plain, archive), asked(other, archive)
-    size = (64, config.env.stack, config.env.size, config.env.size)
-    states = np.random.default_rng(0).integers(0, 256, size, np.uint8)
-    return plain.q_values(states), q_values(states)
+    return ActionValues(network).q_values(states), session.run(None, {"states": states})[0]

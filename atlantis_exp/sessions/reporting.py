@@ -1,52 +1,66 @@
-"""The results that the outputs folder holds, as a table."""
+"""Print the results that the outputs folder holds, as a table."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.table import Table
 
 from atlantis_exp import terminal
-from atlantis_exp.config import PathsConfig
-from atlantis_exp.registry import TABLE_COLUMNS
-from atlantis_exp.runs.folder import EVALUATED, RunFolder, all_runs
+from atlantis_exp.runs.folder import EVALUATED, TABLE_COLUMNS, RunFolder, all_runs
 from atlantis_exp.runs.journal import Metrics
 from atlantis_exp.tracking.publishing import catch_up, how_to_open
 
 
-def report(*, paths: PathsConfig) -> None:
-    """Print every run's evaluation, and how to look further."""
-    outputs = Path(paths.outputs)
+def report(outputs: Path, runs: Sequence[str] = (), where: Sequence[str] = ()) -> None:
+    """Print a line for each run with its last evaluation; `runs` and `where` choose as those of `compare` do.
+
+    Raises:
+        ConfigError: if no run matches a text of `runs` or has a key of `where`.
+        Fault: if a run's folder is damaged.
+    """
     catch_up(outputs)
-    runs = all_runs(outputs)
-    if not runs:
-        print(f"there is no run under {outputs / 'runs'} yet")
+    folders = _chosen(outputs, runs, where)
+    if not folders:
+        print(f"there is no {'such ' if runs or where else ''}run under {outputs / 'runs'} yet")
         return
     shown = outputs.relative_to(Path.cwd()) if outputs.is_relative_to(Path.cwd()) else outputs
     columns = ("run", "steps", "mean", "+-", "median", "IQM", "high", "low", "random", "episodes")
     table = Table(*columns, title=f"last evaluations of the runs in {shown}")
     for column in table.columns[1:]:
         column.justify = "right"
-    results = [run.final_result for run in runs]
-    for run, result in zip(runs, results, strict=True):
-        if result is not None:
+    for run in folders:
+        if (result := run.final_result) is not None:
             earlier = f" (evaluated at {result.evaluated_at:,})" if result.evaluated_at is not None else ""
             table.add_row(run.name, f"{result.steps:,}{earlier}", *_cells(result.evaluation))
-            continue
-        step, evaluation = _last_evaluation(run)
-        table.add_row(run.name, f"{step:,} ({run.state})" if evaluation else run.state, *_cells(evaluation))
+        else:
+            step, evaluation = _last_evaluation(run)
+            table.add_row(run.name, f"{step:,} ({run.state})" if evaluation else run.state, *_cells(evaluation))
     console = terminal.console(least=150)
     console.print(table)
-    for run, result in zip(runs, results, strict=True):
-        if result is not None:
-            console.print(terminal.harmless(f"\n{run.name}\n{result.report}"))
     console.print(how_to_open(outputs), end="")
 
 
-def _last_evaluation(run: RunFolder) -> tuple[int, Mapping[str, float]]:
-    """At which step a run that goes on was evaluated last, and its metrics; none where there was no evaluation yet.
+def _chosen(outputs: Path, runs: Sequence[str], where: Sequence[str]) -> list[RunFolder]:
+    if not (runs or where):
+        return all_runs(outputs)
+    # Numpy takes a fifth of a second to import.
+    from atlantis_exp.comparison.choosing import select
+    from atlantis_exp.comparison.gather import fits, named_by, read_runs, refuse_unknown
 
-    Raises: Fault, where its journal is damaged.
-    """
+    refuse_unknown(outputs, runs)
+    patterns = named_by(outputs, runs)
+    folders = [run for run in all_runs(outputs) if fits(run.name, patterns)]
+    if not where:
+        return folders
+    stored = read_runs(outputs, runs, put_aside=True)
+    for name, reason in stored.skipped.items():
+        terminal.warn(f"left out {name}: {reason}")
+    names = {run.name for run in select(stored.runs, where)}
+    return [run for run in folders if run.name in names]
+
+
+def _last_evaluation(run: RunFolder) -> tuple[int, Mapping[str, float]]:
+    """Return the step of an unfinished run's last evaluation and its metrics; none before the first. Raises: Fault."""
     found: tuple[int, Mapping[str, float]] = (0, {})
     for record in run.records():
         if isinstance(record, Metrics) and record.values.keys() >= EVALUATED:

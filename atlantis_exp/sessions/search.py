@@ -1,455 +1,371 @@
 """A search for the best values of any keys, by Optuna.
 
-A search is a folder: Optuna's journal of the trials, a lock for each of them, and a run of its own that the trials'
-runs are shown under. Any number of processes may work on it. A trial whose process was killed is known by its lock,
-which nobody holds, and goes on with whoever looks for work next: its run is found again by its identity.
+A search is a folder: Optuna's journal of the trials, a lock for each of them, and a page that the trials' runs are
+shown under. Any number of processes may work on it. A trial whose process was killed is one whose lock nobody holds:
+the next process that looks for work continues it, and finds its runs again by their identity.
 """
 
-import dataclasses
-import io
 import os
 import time
 import traceback
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import optuna
-from optuna import Study, Trial
+from optuna import Study, Trial, TrialPruned
+from optuna.distributions import BaseDistribution
 from optuna.pruners import MedianPruner, NopPruner
 from optuna.samplers import TPESampler
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
 from optuna.trial import FrozenTrial, TrialState
 from rich.table import Table
+from scipy.stats import t
 
 from atlantis_exp import terminal
 from atlantis_exp.build import stream
 from atlantis_exp.checking import digest
-from atlantis_exp.config import TrackingConfig
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
-from atlantis_exp.runs.files import ARTIFACT, read_file
+from atlantis_exp.runs.files import ARTIFACT, own, read_file
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Metrics, adopt, fitted
+from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Metrics, Status, adopt
 from atlantis_exp.runs.lock import alone
-from atlantis_exp.runs.provenance import provenance
-from atlantis_exp.sessions.job import Job, command_line, labels
-from atlantis_exp.sessions.space import Space, suggest
+from atlantis_exp.sessions.job import Job, command_line, fitted, labels, replaced
+from atlantis_exp.sessions.page import ending, opened
 from atlantis_exp.sessions.stopping import StopRequest
 from atlantis_exp.sessions.training import train
-from atlantis_exp.tracking.publishing import publishing
 from atlantis_exp.training.trainer import Trainer
 
 _WAIT_SECONDS = 2.0  # between two looks at the trials of other processes
-_SHOWN = 10  # trials in the table at the end
-_STATES = {"COMPLETE": "done", "FAIL": "failed"}  # Optuna's words in ours
+_SHOWN = 10  # rows of the table at the end
 
 
-@dataclasses.dataclass(frozen=True)
-class Request:
-    """A search as it was asked for."""
+@dataclass(frozen=True)
+class Search:
+    """What is searched, over which training, and how."""
 
-    space: Space
+    space: Mapping[str, BaseDistribution]
     texts: Mapping[str, str]  # the space, as typed
     overrides: Sequence[str]  # of the training, as typed
     job_of: Callable[[Sequence[str]], Job]  # the training that overrides make; raises ConfigError
     corner: Job  # one of the trainings in the space
     trials: int
+    seeds: int  # trainings a trial
     name: str | None  # of its folder; None: made from what is searched, and over which training
     startup: int  # trials drawn at random
     pruned_after: int | None  # trials that have ended before any is cut short; None: none ever is
     spared: int  # evaluations of its own that a trial is spared
     command: str  # that continues it
 
-    @property
-    def seed(self) -> int:
-        """Of all trials' trainings, and of what is proposed."""
-        return self.corner.config.seed
 
-    @property
-    def tracking(self) -> TrackingConfig:
-        """Where the search is mirrored to."""
-        return self.corner.config.tracking
+Train = Callable[[Job, Callable[[Trainer], bool]], int | None]
 
 
-def search(request: Request) -> None:
+def search(asked: Search, train: Train = train) -> None:
     """Train one trial after the other, each with the values that Optuna proposes, until there are as many as asked for.
 
     Raises:
-        ConfigError: where the folder is another search's.
-        Fault: where the disk refuses, the time is over, or no trial has ended well.
+        ConfigError: the folder is another search's.
+        Fault: the disk refuses, the time is over, or no trial has ended well.
     """
-    stop = StopRequest(request.corner.config.budget.seconds)
+    config, again = asked.corner.config, f"the search goes on with: {asked.command}"
+    stop = StopRequest(config.budget.seconds)
     with stop.installed():
-        session = _open(request)
-        again = f"the search goes on with: {request.command}"
-        print(f"search {session.folder.name} in {session.folder.path}: {session.counts()}", flush=True)
-        page = _Page(session)
+        trials = Trials(asked, train)
+        folder = trials.folder
+        print(f"search {folder.name} in {folder.path}: {trials.counts()}", flush=True)
+        shown = labels(f"search {' '.join(asked.space)}", run_colour("search"), "search")
+        page = partial(opened, folder, config.tracking, asked.corner.outputs, shown, asked.command)
+        journal: Journal | None = None
         try:
-            with page.kept():
-                has_ended = False
-                while not has_ended and (not stop() or stop.was_a_warning()):
-                    with session.claimed() as trial:
+            with ExitStack() as held:
+                while True:
+                    if journal is None and not folder.is_held:
+                        with suppress(Fault):  # another process was faster
+                            journal = held.enter_context(page(ending=trials.ending))
+                    if journal is not None:
+                        trials.describe(journal)
+                    if trials.have_ended or (stop() and not stop.was_a_warning()):
+                        break
+                    with trials.claimed() as trial:
                         if trial is not None:
-                            session.train(trial, stop)
-                    if trial is not None:
-                        page.update()
-                    elif session.has_ended:
-                        has_ended = True
-                    else:
+                            trials.train(trial, stop)
+                    if trial is None:
                         time.sleep(_WAIT_SECONDS)  # for the trials of other processes, one of which may be killed
         except SystemExit:
             terminal.warn(again)
             raise
-        if not has_ended:
+        if not trials.have_ended:
             stop.end(again)
-    session.print_results()
+    trials.print_results()
 
 
-def _open(request: Request) -> "_Session":
-    """Open the search's folder, which other processes may work on."""
-    config = request.corner.config
-    facts = {"space": dict(request.texts), "training": config.science(), "budget.steps": config.budget.steps}
-    name = request.name or f"search-{digest(facts)}"
-    folder = RunFolder(Path(config.paths.outputs) / "searches" / name)
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    with alone(folder.path / "alone.lock"):
-        if folder.has_started and folder.config != facts:
-            raise ConfigError(f"name={name}: was begun for another space or another training; choose another name")
-        folder.write_config(facts)
-        after = request.pruned_after
-        file = folder.path / "trials.jsonl"
-        try:
-            _mend(file)
-            study = optuna.create_study(
-                storage=JournalStorage(JournalFileBackend(str(file))),
-                study_name=name,
-                direction="maximize",
-                pruner=NopPruner() if after is None else MedianPruner(after, request.spared + 1),
-                load_if_exists=True,
-            )
-        except OSError:
-            raise
-        except Exception as error:  # Optuna checks nothing of what it reads
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
-            raise Fault(
-                f"{file} is damaged ({reason}): restore it, or begin anew with another name=, which finds the trials' "
-                "runs where it draws the same values"
-            ) from None
-    return _Session(request, folder, study)
+class Trials:
+    """The trials of a search, which other processes may work on. Raises: ConfigError, Fault, as `search`."""
 
-
-def _mend(file: Path) -> None:
-    """Drop the end of a line that a process was killed in: the next one would be written behind it, both unreadable."""
-    if not file.exists():
-        return
-    lock = JournalFileSymlinkLock(str(file))  # the one that all processes write under
-    lock.acquire()
-    try:
-        content = read_file(file, ARTIFACT)
-        os.truncate(file, content.rfind(b"\n") + 1)
-    finally:
-        lock.release()
-
-
-@dataclasses.dataclass(frozen=True)
-class _Session:
-    """One process's share of a search."""
-
-    request: Request
-    folder: RunFolder
-    study: Study
+    def __init__(self, asked: Search, train: Train = train) -> None:
+        config = asked.corner.config
+        facts = {"space": dict(asked.texts), "training": config.science(), "budget.steps": config.budget.steps}
+        if asked.seeds > 1:  # an older search names none
+            facts["seeds"] = asked.seeds
+        name = asked.name or f"search-{digest(facts)}"
+        self.asked, self._train = asked, train
+        self.folder = RunFolder(asked.corner.outputs / "searches" / name)
+        with alone(self.folder.path / "alone.lock"):
+            if self.folder.has_started and self.folder.config != facts:
+                raise ConfigError(f"name={name}: was begun for another space or another training; choose another name")
+            self.folder.write_config(facts)
+            self.study = _study(self.folder.path / "trials.jsonl", asked)
 
     @property
-    def trials(self) -> list[FrozenTrial]:
-        """All trials so far, as Optuna knows them; each at its number."""
+    def all(self) -> list[FrozenTrial]:
+        """All trials so far, each at its number."""
         return self.study.get_trials(deepcopy=False)
 
     @property
-    def has_ended(self) -> bool:
+    def have_ended(self) -> bool:
         """Whether there is nothing left to train, here or elsewhere."""
-        trials = self.trials
-        return len(trials) >= self.request.trials and "running" not in map(_state, trials)
+        trials = self.all
+        return len(trials) >= self.asked.trials and all(trial.state.is_finished() for trial in trials)
 
     @property
-    def ranking(self) -> list[FrozenTrial]:
-        """The trials that were trained to their end, the best first."""
-        done = [trial for trial in self.trials if _state(trial) == "done"]
-        return sorted(done, key=lambda trial: -(trial.value or 0.0))
+    def ranking(self) -> list[tuple[FrozenTrial, list[float]]]:
+        """The values that were trained to their end, the best first: their first trial, the scores of all."""
+        tried: dict[str, tuple[FrozenTrial, list[float]]] = {}
+        for trial in self.all:
+            if trial.state == TrialState.COMPLETE:
+                tried.setdefault(str(trial.params), (trial, []))[1].extend(trial.user_attrs["scores"])
+        return sorted(tried.values(), key=lambda each: -np.mean(each[1]))
+
+    def ending(self, error: BaseException | None) -> tuple[Status, str]:
+        """Return the status of the page when this process leaves it."""
+        return ending(error) if error or self.have_ended else ("KILLED", "")
 
     def counts(self) -> str:
-        """How many trials there are, and in which states."""
-        states = Counter(_state(trial) for trial in self.trials)
+        """Return how many trials there are, and in which states."""
+        states = Counter(trial.state.name.lower() for trial in self.all)
         each = [f"{count} {state}" for state, count in states.items()]
-        return ", ".join([f"{states.total()} of {self.request.trials} trials", *each])
+        return ", ".join([f"{states.total()} of {self.asked.trials} trials", *each])
 
     @contextmanager
     def claimed(self) -> Iterator[Trial | None]:
-        """The trial to be trained next, held until the block ends: one that a killed process left, or a new one."""
+        """Hold the trial to be trained next while the block runs: one that a killed process left, or a new one."""
         with ExitStack() as held:
+            trial = None
             with alone(self.folder.path / "alone.lock"):
-                trial = self._next()
-                if trial is not None:
-                    held.enter_context(self._lock(trial.number).held())
+                trials = self.all
+                left = [each for each in trials if not (each.state.is_finished() or self._lock(each.number).is_held)]
+                if left or len(trials) < self.asked.trials:
+                    number = left[0].number if left else len(trials)
+                    held.enter_context(self._lock(number).held())
+                    # A seed a trial: processes with one seed would propose the same, and so would a restarted one.
+                    seed = stream(self.asked.corner.config.seed, f"trial {number}").generate_state(1).item()
+                    self.study.sampler = TPESampler(seed=seed, n_startup_trials=self.asked.startup)
+                    trial = Trial(self.study, left[0]._trial_id) if left else self.study.ask()
+                    for key, distribution in self.asked.space.items():
+                        trial._suggest(key, distribution)  # what the killed process drew already stays
             yield trial
-
-    def _next(self) -> Trial | None:
-        trials = self.trials
-        left = [trial for trial in trials if _state(trial) == "running" and not self._lock(trial.number).is_held]
-        if not left and len(trials) >= self.request.trials:
-            return None
-        number = left[0].number if left else len(trials)
-        # A seed a trial: processes that worked with one seed would propose the same, and so would a restarted one.
-        seed = stream(self.request.seed, f"trial {number}").generate_state(1).item()
-        self.study.sampler = TPESampler(seed=seed, n_startup_trials=self.request.startup)
-        trial = Trial(self.study, left[0]._trial_id) if left else self.study.ask()
-        suggest(trial, self.request.space)  # what the killed process drew already stays
-        return trial
 
     def _lock(self, number: int) -> RunFolder:
         return RunFolder(self.folder.path / "trials" / f"{number:04}")
 
     def train(self, trial: Trial, stop: StopRequest) -> None:
-        """Train a trial's run, from where it is, and tell Optuna how it ended; nothing where `stop` ended it."""
-        overrides = [*self.request.overrides, *_values(trial)]
-        watch = _Watch(trial, stop, set(self.trials[trial.number].intermediate_values), self.folder.name)
-        score, error = None, ""
+        """Train a trial's runs, from where they are, and tell Optuna the result; nothing where `stop` ended them."""
+        scores: list[float] = []
         try:
-            score = self._score(trial, overrides, watch, stop)
-        except Fault as fault:
-            if isinstance(fault.__cause__, OSError):
-                raise  # of the machine: no trial would fare better
-            error = str(fault)
-        except (RuntimeError, MemoryError) as unforeseen:  # of torch, above all where memory is short
-            traceback.print_exc()
-            error = f"{type(unforeseen).__name__}: {unforeseen}"
-        if error:
-            trial.set_user_attr("error", error)
-            self.study.tell(trial.number, state=TrialState.FAIL)
-        elif score is not None:
-            self.study.tell(trial.number, score)
-        elif watch.pruned:
+            for index in range(self.asked.seeds):
+                if (score := self._score(trial, index, stop)) is None:
+                    return
+                scores.append(score)
+            trial.set_user_attr("scores", scores)
+            self.study.tell(trial.number, float(np.mean(scores)))
+        except TrialPruned:
             self.study.tell(trial.number, state=TrialState.PRUNED)
-        else:
-            return
-        self._print(trial.number)
+        except (RuntimeError, MemoryError) as error:  # faults, and torch's own, above all where memory is short
+            if isinstance(error.__cause__, OSError):
+                raise  # of the machine: no trial would fare better
+            if not isinstance(error, Fault):
+                traceback.print_exc()
+            trial.set_user_attr("error", str(error) if isinstance(error, Fault) else f"{type(error).__name__}: {error}")
+            self.study.tell(trial.number, state=TrialState.FAIL)
+        print(f"\ntrial {trial.number}: {_described(self.all[trial.number])}; {self.counts()}\n", flush=True)
 
-    def _score(self, trial: Trial, overrides: Sequence[str], watch: "_Watch", stop: StopRequest) -> float | None:
-        """Train a trial's run; the mean of its last evaluation, None where `watch` has ended it.
+    def _score(self, trial: Trial, index: int, stop: StopRequest) -> float | None:
+        """Train one of a trial's runs; return the mean of its last evaluation, None where `stop` ended it.
 
-        The mean is what all tables compare. Of the last evaluation, not of the best: the best of many is the luckiest.
+        The mean is what all tables compare. Of the last evaluation, not of the best: the best of several is the
+        luckiest.
+
+        Raises:
+            TrialPruned: the trial was cut short, which its first run decides.
+            Fault: the run failed.
         """
-        for other in self.trials[: trial.number]:
-            if other.params == trial.params and _state(other) == "running":
-                raise Fault(f"trial {other.number}, which is under way, has the same values")
-        try:
-            job = self.request.job_of(overrides)
-        except ConfigError as error:
-            raise Fault(str(error)) from None
-        # The time is the search's, and whatever is there of a trial is what its killed process left.
-        budget = dataclasses.replace(job.config.budget, wall_clock=None)
-        config = dataclasses.replace(job.config, resume="auto", budget=budget)
+        job = self.job(trial, index)
+        # The time is the search's, and what is there of a trial is what its killed process left.
+        config = replace(job.config, resume="auto", budget=replace(job.config.budget, wall_clock=None))
         run = RunFolder.of(config)
-        trial.set_user_attr("run", run.name)
+        told = self.all[trial.number]
+        trial.set_user_attr("runs", [*dict.fromkeys([*told.user_attrs.get("runs", []), run.name])])
         with suppress(Fault), run.held():  # what runs elsewhere stays where it is
             adopt(run.path, self.folder.path)
-        if (late := train(dataclasses.replace(job, config=config), watch)) is not None:
+        seen, pruned, stopped = 0, False, False
+
+        def watch(trainer: Trainer) -> bool:
+            nonlocal seen, pruned, stopped
+            recorder = trainer.recorder
+            # Counted, not by their step: trials whose episodes have other lengths are compared all the same.
+            if index == 0 and recorder.evaluations > seen:
+                seen = recorder.evaluations
+                if seen not in told.intermediate_values:
+                    trial.report(recorder.last_metrics["evaluation/mean"], seen)
+                if pruned := trial.should_prune():
+                    where = f"trial {trial.number} of {self.folder.name}, at step {trainer.counters.steps:,}"
+                    recorder.tracker.tags({"pruned": where})
+            stopped = stop()
+            return pruned or stopped
+
+        if (late := self._train(replace(job, config=config), watch)) is not None:
             stop.signal = late  # it came when the run had nothing left to stop
-        if watch.pruned or watch.stopped:
+        if pruned:
+            raise TrialPruned
+        if stopped:
             return None
-        result = run.result
+        result, most = run.result, config.budget.steps
         assert result is not None
-        most = config.budget.steps
         if most is not None and result.steps >= most + config.env.num_envs:
             raise Fault(f"run {run.name} was trained for {result.steps:,} steps already, more than budget.steps={most}")
         return result.evaluation["evaluation/mean"]
 
-    def _print(self, number: int) -> None:
-        trial, ranking = self.trials[number], self.ranking
-        best = f"; best {ranking[0].value:,.0f} (trial {ranking[0].number})" if ranking else ""
-        print(f"\ntrial {number}: {_describe(trial)}, {_outcome(trial)}{best}; {self.counts()}\n", flush=True)
+    def job(self, trial: FrozenTrial | Trial, index: int) -> Job:
+        """Return one of a trial's trainings. Values that are drawn again are trained with other seeds."""
+        before = sum(other.params == trial.params for other in self.all[: trial.number])
+        seed = self.asked.corner.config.seed + before * self.asked.seeds + index
+        return self.asked.job_of([*replaced(self.asked.overrides, f"seed={seed}"), *_values(trial)])
 
-    def best_command(self) -> str:
-        """The command that trains the best trial's config in full, empty before there is one."""
+    def conclusion(self) -> list[str]:
+        """Return what the ranking is worth, and the commands that test its best values and train them in full.
+
+        `decide` trains other seeds than a search, so that the luck of the search does not enter its answer.
+        """
         if not (ranking := self.ranking):
-            return ""
-        overrides = [
-            text for text in self.request.overrides if not text.startswith(("budget.steps", "budget.wall_clock"))
-        ]
-        return command_line(*overrides, *_values(ranking[0]))
+            return []
+        best, asked, lines = ranking[0][0], self.asked, []
+        if all(len(scores) == 1 for _, scores in ranking):
+            lines.append(
+                "One training each: other seeds may rank the values differently; seeds=3 trains three a trial."
+            )
+        if len(ranking) > 1:
+            lines.append(f"The best of {len(ranking)} is partly luck: its own mean is optimistic.")
+        job = self.job(best, 0)
+        with suppress(ConfigError):  # without the values, this may be no training
+            default = asked.job_of(replaced(asked.overrides, f"seed={job.config.seed}"))
+            if default.config.run_name() != job.config.run_name():
+                shared = _without(asked.overrides, "seed", "resume", "budget.wall_clock")
+                against = f"against={','.join(_values(best))}"
+                lines.append(f"Better than the default? {command_line('decide', *shared, against)}")
+        full = _without(job.overrides, "budget.steps", "budget.wall_clock")
+        return [*lines, f"The best in full: {command_line(*full)}"]
 
-    def print_results(self) -> None:
-        """Print the best trials, and how to train the best one in full. Raises: Fault where there is none."""
-        ranking = self.ranking
-        if not ranking:
-            raise Fault(f"search {self.folder.name}: no trial was trained to its end; {self.counts()}")
-        table = Table("trial", "mean", *self.request.space, "run", title=f"{self.folder.name}: {self.counts()}")
-        for column in table.columns[:2]:
-            column.justify = "right"
-        for trial in ranking[:_SHOWN]:
-            values = (_short(trial.params[key]) for key in self.request.space)
-            table.add_row(str(trial.number), f"{trial.value:,.0f}", *values, trial.user_attrs["run"])
-        console = terminal.console(least=130)
-        console.print(table)
-        console.print(f"\nthe best in full: {self.best_command()}", soft_wrap=True)
-
-
-class _Watch:
-    """Tells Optuna of a training's evaluations, and says when it is to end."""
-
-    def __init__(self, trial: Trial, stop: StopRequest, reported: set[int], search: str) -> None:
-        self.pruned = self.stopped = False
-        self._trial, self._stop, self._reported, self._search = trial, stop, reported, search
-        self._evaluations = 0
-
-    def __call__(self, trainer: Trainer) -> bool:
-        recorder = trainer.recorder
-        if recorder.evaluations > self._evaluations:
-            # Counted, not by their step: trials whose episodes have other lengths are compared all the same.
-            self._evaluations = recorder.evaluations
-            if self._evaluations not in self._reported:
-                self._trial.report(recorder.last_metrics["evaluation/mean"], self._evaluations)
-            if self._trial.should_prune():
-                self.pruned = True
-                where = f"trial {self._trial.number} of {self._search}, at step {trainer.counters.steps:,}"
-                recorder.tracker.tags({"pruned": where})
-        self.stopped = self._stop()
-        return self.pruned or self.stopped
-
-
-class _Page:
-    """The search's own run, written by whichever of its processes holds it."""
-
-    def __init__(self, session: _Session) -> None:
-        self._session = session
-        self._held = ExitStack()
-        self._journal: Journal | None = None
-        self._drawn = 0  # trials in the figures
-
-    @contextmanager
-    def kept(self) -> Iterator[None]:
-        """Write the page before and after the block."""
-        error: BaseException | None = None
-        with self._held:
-            try:
-                self.update()
-                yield
-            except BaseException as raised:
-                error = raised
-                raise
-            finally:
-                self.update()
-                if self._journal is not None:
-                    if self._session.has_ended:
-                        self._journal.status("FINISHED")
-                    elif isinstance(error, Exception):
-                        self._journal.status("FAILED", str(error))
-                    else:
-                        self._journal.status("KILLED")
-
-    def update(self) -> None:
-        """Write what state the trials are in, if no other process does."""
-        if self._journal is None and not self._session.folder.is_held:
-            self._take()
-        if self._journal is not None:
-            self._write(self._journal)
-
-    def _take(self) -> None:
-        session, request = self._session, self._session.request
-        try:
-            self._held.enter_context(session.folder.held())
-        except Fault:
-            return  # another process was faster
-        shown = labels(f"search {' '.join(request.space)}", run_colour("search"), "search")
-        journal = self._held.enter_context(publishing(session.folder, request.tracking, request.corner.outputs, shown))
-        if not journal.resume():
-            journal.params({f"space/{key}": text for key, text in request.texts.items()})
-        journal.tags(provenance(request.command))
-        journal.status("RUNNING")
-        self._journal = journal
-
-    def _write(self, journal: Journal) -> None:
-        session = self._session
-        told = {record.step for record in session.folder.records() if isinstance(record, Metrics)}
-        ranking = session.ranking
-        for trial in sorted(ranking, key=lambda trial: trial.number):
-            if trial.number not in told:
-                best = max(other.value or 0.0 for other in ranking if other.number <= trial.number)
-                journal.metrics({"search/mean": trial.value or 0.0, "search/best": best}, trial.number)
-        rows = [
-            f"| {trial.number} | {_describe(trial)} | {_outcome(trial)} | {trial.user_attrs.get('run', '')} |"
-            for trial in [*ranking, *(trial for trial in session.trials if trial not in ranking)]
-        ]
-        parts = [
-            f"{session.counts()}. Continue, or help along from another terminal: `{session.request.command}`",
-            f"The best in full: `{session.best_command()}`" if ranking else "",
-        ]
-        above = "\n\n".join(part for part in parts if part)
-        table = ["| trial | values | result | run |", "| ---: | --- | --- | --- |", *rows]
-        journal.note(f"{above}\n\n{fitted(table, NOTE_LENGTH - len(above), '`trials.jsonl`')}")
-        if len(ranking) > max(1, self._drawn):
-            self._drawn = len(ranking)
-            for name, picture in _draw(session.study).items():
-                journal.artifact(f"{name}.png", picture)
+    def describe(self, journal: Journal) -> None:
+        """Write to the search's page how the trials stand."""
+        told = {record.step for record in self.folder.records() if isinstance(record, Metrics)}
+        best, rows = float("-inf"), ["| trial | values and result | runs |", "| ---: | --- | --- |"]
+        for trial in self.all:
+            rows.append(f"| {trial.number} | {_described(trial)} | {', '.join(trial.user_attrs.get('runs', []))} |")
+            if trial.state == TrialState.COMPLETE and trial.value is not None:
+                best = max(best, trial.value)
+                if trial.number not in told:
+                    journal.metrics({"search/mean": trial.value, "search/best": best}, trial.number)
+        above = "\n\n".join(
+            [
+                f"{self.counts()}. Continue, or help along from another terminal: `{self.asked.command}`",
+                *self.conclusion(),
+                f"Figures: `optuna-dashboard {self.folder.path / 'trials.jsonl'}`",
+            ]
+        )
+        journal.note(f"{above}\n\n{fitted(rows, NOTE_LENGTH - len(above), '`trials.jsonl`')}")
         journal.flush()
 
+    def print_results(self) -> None:
+        """Print the best values, and what they are worth. Raises: Fault where there are none."""
+        if not (ranking := self.ranking):
+            raise Fault(f"search {self.folder.name}: no trial was trained to its end; {self.counts()}")
+        table = Table("trial", "mean", "95 %", *self.asked.space, "run", title=f"{self.folder.name}: {self.counts()}")
+        for column in table.columns[:2]:
+            column.justify = "right"
+        for trial, scores in ranking[:_SHOWN]:
+            values = (_short(trial.params[key]) for key in self.asked.space)
+            mean = f"{np.mean(scores):,.0f}"
+            table.add_row(str(trial.number), mean, _interval(scores), *values, trial.user_attrs["runs"][0])
+        console = terminal.console(least=130)
+        console.print(table)
+        for line in self.conclusion():
+            console.print(f"\n{line}", soft_wrap=True)
 
-def _draw(study: Study) -> dict[str, bytes]:
-    """Which keys matter, which values go together, and how the search went, as PNGs by name.
 
-    Importance is Optuna's default, PED-ANOVA: it asks what tells the better trials from all, in milliseconds, and needs
-    no forest of trees to be fitted as fANOVA does.
-    """
-    import matplotlib as mpl
+def _study(file: Path, asked: Search) -> Study:
+    """Open Optuna's record of the trials, or begin one. Raises: Fault where it is damaged."""
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    after = asked.pruned_after
+    try:
+        if file.exists():
+            own(file)  # Optuna writes it in place
+            lock = JournalFileSymlinkLock(str(file))  # all processes write under it
+            lock.acquire()
+            try:  # to drop the end of a line that a process was killed in: the next would be written behind it
+                os.truncate(file, read_file(file, ARTIFACT).rfind(b"\n") + 1)
+            finally:
+                lock.release()
+        return optuna.create_study(
+            storage=JournalStorage(JournalFileBackend(str(file))),
+            study_name=file.parent.name,
+            direction="maximize",
+            pruner=NopPruner() if after is None else MedianPruner(after, asked.spared + 1),
+            load_if_exists=True,
+        )
+    except OSError:
+        raise
+    except Exception as error:  # Optuna checks nothing of what it reads
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise Fault(
+            f"{file} is damaged ({reason}): restore it, or begin anew with another name=, which finds the trials' "
+            "runs where it draws the same values"
+        ) from None
 
-    mpl.use("agg")
-    from matplotlib import pyplot as plt
-    from optuna.visualization import matplotlib as drawing
 
-    drawers: dict[str, Callable[[Study], Any]] = {
-        "importance": drawing.plot_param_importances,
-        "parallel_coordinates": drawing.plot_parallel_coordinate,
-        "history": drawing.plot_optimization_history,
-    }
-    pictures = {}
-    with mpl.rc_context(), warnings.catch_warnings():  # Optuna sets a style of its own, and calls it experimental
-        warnings.simplefilter("ignore")
-        for name, draw in drawers.items():
-            figure = draw(study).figure
-            figure.set_size_inches(9, 5)
-            buffer = io.BytesIO()
-            figure.savefig(buffer, format="png", dpi=100, bbox_inches="tight")
-            plt.close(figure)
-            pictures[name] = buffer.getvalue()
-    return pictures
+def _interval(scores: Sequence[float]) -> str:
+    """Return the 95 % interval of a mean, by Student's t over its own trainings."""
+    if (count := len(scores)) == 1:
+        return "one training"
+    half = t.ppf(0.975, count - 1) * np.std(scores, ddof=1) / np.sqrt(count)
+    return f"{np.mean(scores) - half:,.0f} to {np.mean(scores) + half:,.0f}"
+
+
+def _without(overrides: Sequence[str], *keys: str) -> list[str]:
+    return [text for text in overrides if text.lstrip("+").partition("=")[0] not in keys]
 
 
 def _values(trial: Trial | FrozenTrial) -> list[str]:
     return [f"{key}={value}" for key, value in trial.params.items()]
 
 
-def _describe(trial: FrozenTrial) -> str:
-    return " ".join(f"{key}={_short(value)}" for key, value in trial.params.items())
-
-
-def _outcome(trial: FrozenTrial) -> str:
-    match _state(trial):
-        case "done":
-            return f"mean {trial.value:,.0f}"
-        case "pruned":
-            return f"pruned at evaluation {trial.last_step} with mean {trial.value:,.0f}"
-        case "failed":
-            return f"failed: {trial.user_attrs['error']}"
-        case state:
-            return state
-
-
-def _state(trial: FrozenTrial) -> str:
-    return _STATES.get(trial.state.name, trial.state.name.lower())
+def _described(trial: FrozenTrial) -> str:
+    """Return a trial's values and its result."""
+    result = trial.state.name.lower()
+    match trial.state:
+        case TrialState.COMPLETE:
+            result = f"mean {trial.value:,.0f}"
+        case TrialState.PRUNED:
+            result = f"pruned at evaluation {trial.last_step} with mean {trial.value:,.0f}"
+        case TrialState.FAIL:
+            result = f"failed: {trial.user_attrs['error']}"
+    return f"{' '.join(f'{key}={_short(value)}' for key, value in trial.params.items())}, {result}"
 
 
 def _short(value: object) -> str:

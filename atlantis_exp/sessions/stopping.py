@@ -1,6 +1,5 @@
 """How a training is asked to stop: by a signal, by the end of its time, or because its sweep has ended."""
 
-import os
 import signal
 import sys
 import time
@@ -10,7 +9,7 @@ from math import inf
 from types import FrameType
 from typing import Any, NoReturn
 
-from atlantis_exp import terminal
+from atlantis_exp import interrupts, terminal
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder
 
@@ -20,15 +19,24 @@ _LOOK_SECONDS = 1.0  # between two looks at whether the sweep goes on
 class StopRequest:
     """Turns the first SIGINT, SIGTERM or SIGUSR2, or the end of the time, into a flag that the trainer looks at.
 
+    The time begins with the first look, after the first step: a session whose set-up takes longer makes progress, too.
+
     So does the end of the sweep that the run is a job of, as `sweep_goes_on` tells it. A second SIGINT ends the process
     at once; what was committed stays. Under Slurm SIGTERM is a warning: the run is committed and goes on, since Slurm
     itself requeues or kills it.
     """
 
-    def __init__(self, seconds: float | None = None, sweep_goes_on: Callable[[], bool] = lambda: True) -> None:
+    def __init__(
+        self,
+        seconds: float | None = None,
+        sweep_goes_on: Callable[[], bool] = lambda: True,
+        under_slurm: bool = False,
+    ) -> None:
         self.signal: int | None = None
+        self._under_slurm = under_slurm
         self._is_warned = False  # by Slurm
-        self._deadline = inf if seconds is None else time.monotonic() + seconds
+        self._seconds = seconds
+        self._deadline = inf
         self._sweep_goes_on = sweep_goes_on
         self._sweep_has_ended = False
         self._looked = 0.0  # time
@@ -36,6 +44,8 @@ class StopRequest:
 
     def __call__(self) -> bool:
         now = time.monotonic()
+        if self._seconds is not None and self._deadline == inf:  # the first step is made: set-up is no part of the time
+            self._deadline = now + self._seconds
         if now - self._looked >= _LOOK_SECONDS:
             self._looked = now
             self._sweep_has_ended = self._sweep_has_ended or not self._sweep_goes_on()
@@ -62,7 +72,8 @@ class StopRequest:
         """Listen while the block runs."""
         signals = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
         self._before = {number: signal.signal(number, self._receive) for number in signals}
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)  # as inherited from a launcher's worker
+        if interrupts.seen():  # and swallowed
+            self.signal = signal.SIGINT
         try:
             yield
         finally:
@@ -73,17 +84,15 @@ class StopRequest:
         if self.signal is not None and number == signal.SIGINT:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
             signal.raise_signal(signal.SIGINT)
-        if number == signal.SIGTERM and "SLURM_JOB_ID" in os.environ:
+        if number == signal.SIGTERM and self._under_slurm:
             self._is_warned = True  # apart, as a SIGUSR2 before it still means that the job is to be requeued
         else:
             self.signal = number
 
 
 def sweep_goes_on(folder: RunFolder, launcher: str | None) -> Callable[[], bool]:
-    """What tells whether the process that launched this job still wants it; Slurm's jobs do without that process."""
-    if folder.parent is None or launcher not in ("joblib", "apart", "ray"):
+    """Return a call that tells whether the process that launched this job still wants it; Slurm's jobs outlive it."""
+    if folder.parent is None or launcher != "joblib":
         return lambda: True
     sweep = RunFolder(folder.parent)
-    if launcher == "ray":  # whose machines may not see each other's locks
-        return lambda: sweep.status == "RUNNING"
-    return lambda: sweep.status == "RUNNING" and sweep.is_held
+    return lambda: sweep.is_held

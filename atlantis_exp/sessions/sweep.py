@@ -1,31 +1,30 @@
-"""A sweep as a run of its own: what its runs are shown under, with their table and figures on its page."""
+"""A sweep as a run of its own that its trainings are shown under, with their table on its page."""
 
 import csv
 import io
-import signal
-import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from types import FrameType
-from typing import Any, NoReturn, get_args
-
-import numpy as np
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any, get_args
 
 from atlantis_exp import terminal
 from atlantis_exp.checking import digest
 from atlantis_exp.faults import Fault
-from atlantis_exp.media import curves, strips
-from atlantis_exp.registry import TABLE_COLUMNS
-from atlantis_exp.runs.folder import TRACEBACK, RunFolder, State
-from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, adopt, curve, fitted
-from atlantis_exp.runs.provenance import provenance
-from atlantis_exp.sessions.job import Job
-from atlantis_exp.sessions.launchers import BASIC, Launcher, joblib, ray, slurm
+from atlantis_exp.runs.folder import TABLE_COLUMNS, TRACEBACK, RunFolder, State
+from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, adopt
+from atlantis_exp.sessions.job import Job, fitted
+from atlantis_exp.sessions.launchers import BASIC, Launcher, slurm
 from atlantis_exp.sessions.live import LiveTable
-from atlantis_exp.tracking.publishing import catch_up, publishing
+from atlantis_exp.sessions.page import ending, opened, terminable
+from atlantis_exp.tracking.publishing import catch_up
 
 _PAGE_SECONDS = 60.0  # between two looks at the runs while they are trained
+
+Runs = Mapping[RunFolder, Job]
+"""The folders of a sweep's runs, each with its training."""
 
 
 @contextmanager
@@ -37,121 +36,93 @@ def ledger(
     Where a launcher runs the jobs in other processes, these write their folders only: this one shows their progress,
     publishes them, and, but for Slurm's, has them commit before it ends itself.
 
-    Whatever process trains them, the runs know their parent from their folders, where it is noted before the first
-    starts. The same set of runs is the same parent again. However the block ends, the page is closed with it.
+    The runs know their parent from their folders, where it is noted before the first starts. The same set of runs is
+    the same parent again. However the block ends, the page is closed with it.
 
     swept: the overrides that name several values, as typed.
     command: what repeats the sweep.
 
     Raises:
-        Fault: while another process runs the same sweep.
+        Fault: another process runs the same sweep.
     """
-    jobs = list({job.config.run_name(): job for job in jobs}.values())
-    folders = [RunFolder.of(job.config) for job in jobs]
-    _print_table(folders)
+    runs = {RunFolder.of(job.config): job for job in jobs}
+    is_shown = not launcher.is_basic or jobs[0].config.tracking.name != "none"
+    _print_table(runs)
     try:
-        if launcher.is_basic and jobs[0].config.tracking.name == "none":
+        with _page(runs, swept, launcher, command) if is_shown else nullcontext():
             yield
-        else:
-            with _page(jobs, folders, swept, launcher, command):
-                yield
     finally:
-        _print_table(folders)
+        _print_table(runs)
 
 
-def _print_table(folders: Sequence[RunFolder]) -> None:
-    states = [folder.state for folder in folders]
-    for folder, state in zip(folders, states, strict=True):
-        print(f"  {state:12}{folder.name}{_reason(folder)}")
-    counts = ", ".join(f"{states.count(state)} {state}" for state in get_args(State) if state in states)
-    print(f"sweep of {len(folders)} runs: {counts}", flush=True)
+def _print_table(runs: Runs) -> None:
+    states = {folder: folder.state for folder in runs}
+    for folder, state in states.items():
+        print(f"  {state:12}{folder.name}{_reason(folder, state)}")
+    counted = Counter(states.values())
+    counts = ", ".join(f"{counted[state]} {state}" for state in get_args(State) if state in counted)
+    print(f"sweep of {len(runs)} runs: {counts}", flush=True)
 
 
-def _reason(folder: RunFolder) -> str:
-    """Why a run failed or was killed, and the file that tells more."""
+def _reason(folder: RunFolder, state: State) -> str:
+    """Return why a run failed or was killed, and the file that tells more."""
     if not folder.error:
         return ""
     path = folder.path / TRACEBACK
-    return f": {terminal.harmless(folder.error)}" + (f" ({path})" if folder.state == "failed" and path.exists() else "")
+    return f": {terminal.harmless(folder.error)}" + (f" ({path})" if state == "failed" and path.exists() else "")
 
 
 @contextmanager
-def _page(
-    jobs: Sequence[Job], folders: Sequence[RunFolder], swept: Sequence[str], launcher: Launcher, command: str
-) -> Iterator[None]:
-    outputs = jobs[0].outputs
-    identity = digest({"runs": sorted(folder.name for folder in folders)})
-    sweep = RunFolder(outputs / "sweeps" / f"sweep-{identity}")
-    name = f"sweep {' '.join(swept)}"
-    shown = {"mlflow.runName": name, "atlantis.kind": "training sweep"}
-    if not launcher.is_basic:
-        catch_up(outputs, jobs[0].config.tracking.uri)  # the jobs do not
-    others = () if launcher.is_basic else folders
-    with sweep.held(), terminable():
-        for job, folder in zip(jobs, folders, strict=True):
+def _page(runs: Runs, swept: Sequence[str], launcher: Launcher, command: str) -> Iterator[None]:
+    config = next(iter(runs.values())).config
+    outputs = Path(config.paths.outputs)
+    sweep = RunFolder(outputs / "sweeps" / f"sweep-{digest({'runs': sorted(folder.name for folder in runs)})}")
+    labels = {"mlflow.runName": f"sweep {' '.join(swept)}", "atlantis.kind": "training sweep"}
+
+    def adopt_all() -> None:
+        for folder, job in runs.items():
             with suppress(Fault):  # what runs elsewhere stays where it is
                 if job.config.resume == "never" and not launcher.is_basic and folder.has_started:
                     print(f"the run that was here is kept as {folder.put_aside()}")
                 with folder.held():
                     adopt(folder.path, sweep.path)
-        with publishing(sweep, jobs[0].config.tracking, outputs, shown, others) as journal:
-            was_finished = sweep.status == "FINISHED"
-            journal.resume()
-            journal.tags(provenance(command))
-            _describe(journal, jobs, folders)
-            journal.status("RUNNING")
-            error: BaseException | None = None
-            try:
-                with (
-                    _every(_PAGE_SECONDS, lambda: _describe(journal, jobs, folders)) as close,
-                    _launched(launcher, journal, jobs, folders, close),
-                ):
-                    yield
-            except BaseException as raised:
-                error = raised
-                raise
-            finally:
-                status, reason = _ending(folders, error)
-                try:
-                    _draw(journal, jobs, folders, was_finished)
-                    _describe(journal, jobs, folders)
-                finally:
-                    journal.status(status, reason)
+
+    if not launcher.is_basic:
+        catch_up(outputs, config.tracking.uri)  # the jobs do not
+    others = () if launcher.is_basic else tuple(runs)
+    with (
+        terminable(),
+        opened(
+            *(sweep, config.tracking, outputs, labels, command),
+            prepare=adopt_all,
+            others=others,
+            ending=partial(_ending, runs),
+        ) as journal,
+    ):
+        describe = partial(_describe, journal, runs)
+        describe()
+        try:
+            with _every(_PAGE_SECONDS, describe), _launched(launcher, runs):
+                yield
+        finally:
+            _tabulate(journal, runs)
+            describe()
 
 
 @contextmanager
-def _launched(
-    launcher: Launcher,
-    journal: Journal,
-    jobs: Sequence[Job],
-    folders: Sequence[RunFolder],
-    close_page: Callable[[], None],
-) -> Iterator[None]:
+def _launched(launcher: Launcher, runs: Runs) -> Iterator[None]:
     """Show the jobs of a launcher while it runs them, in the context that it needs."""
     if launcher.is_basic:
         yield
         return
-    match launcher.name:
-        case "joblib":
-            context: AbstractContextManager[None] = joblib.jobs(journal, jobs, close_page, launcher)
-        case "ray":
-            context = ray.jobs(journal, folders, close_page, launcher)
-        case "slurm":
-            context = slurm.all_awaited()
-        case _:
-            context = nullcontext()
-    table = LiveTable(jobs, folders)
-    with context:
-        try:
-            with _every(table.seconds, table.look):
-                yield
-        finally:
-            table.close()
+    context: AbstractContextManager[None] = slurm.all_awaited() if launcher.name == "slurm" else nullcontext()
+    with context, closing(LiveTable([*runs.values()], [*runs])) as table, _every(table.seconds, table.look):
+        yield
 
 
 @contextmanager
-def _every(seconds: float, look: Callable[[], None]) -> Iterator[Callable[[], None]]:
-    """Calls `look` now and then in a thread, until the block or a call of what it yields ends."""
+def _every(seconds: float, look: Callable[[], None]) -> Iterator[None]:
+    """Call `look` now and then in a thread until the block ends."""
     closing = threading.Event()
 
     def run() -> None:
@@ -159,112 +130,55 @@ def _every(seconds: float, look: Callable[[], None]) -> Iterator[Callable[[], No
             with suppress(OSError, ValueError, Fault):  # the next look may fare better
                 look()
 
-    def close() -> None:
-        closing.set()
-        thread.join()
-
     thread = threading.Thread(target=run, name=f"every {seconds:g} s", daemon=True)
     thread.start()
     try:
-        yield close
-    finally:
-        close()
-
-
-@contextmanager
-def terminable() -> Iterator[None]:
-    """SIGTERM ends the process as an exception does; a run that is trained in the block listens for itself."""
-
-    def end(number: int, _: FrameType | None) -> NoReturn:
-        sys.exit(128 + number)
-
-    before = signal.signal(signal.SIGTERM, end)
-    try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        closing.set()
+        thread.join()
 
 
-def _ending(folders: Sequence[RunFolder], error: BaseException | None) -> tuple[Status, str]:
-    failures = [f"{folder.name}: {folder.error}" for folder in folders if folder.state == "failed"]
+def _ending(runs: Runs, error: BaseException | None) -> tuple[Status, str]:
+    failures = [f"{folder.name}: {folder.error}" for folder in runs if folder.state == "failed"]
     if failures:
-        return "FAILED", "\n".join([f"{len(failures)} of {len(folders)} runs failed", *failures])
-    if error is None and all(folder.state == "done" for folder in folders):
-        return "FINISHED", ""
-    ran_out_of_time = isinstance(error, Fault) and error.exit_code == 124
-    if isinstance(error, Exception) and not ran_out_of_time:
-        return "FAILED", str(error)
-    return "KILLED", ""
+        return "FAILED", "\n".join([f"{len(failures)} of {len(runs)} runs failed", *failures])
+    if error is None and any(folder.state != "done" for folder in runs):
+        return "KILLED", ""
+    return ending(error)
 
 
-def _describe(journal: Journal, jobs: Sequence[Job], folders: Sequence[RunFolder]) -> None:
+def _describe(journal: Journal, runs: Runs) -> None:
     """Write the sweep's table to its page."""
     head = ("run", "state", "steps", "mean", "+-", "median", "IQM", "high", "low", "hours")
     lines = [f"| {' | '.join(head)} |", f"|{' --- |' * 2}{' ---: |' * 8}"]
     failures = []
-    for job, folder in zip(jobs, folders, strict=True):
-        row = [job.title, folder.state]
+    for folder, job in runs.items():
+        row = [job.title, folder.state, *[""] * 8]
         if (result := folder.result) is not None:
-            scores = [
-                f"{result.evaluation[f'evaluation/{point}']:,.0f}" for point in TABLE_COLUMNS if result.evaluation
-            ]
-            hours = f"{result.counts['hours']:.2f}" if "hours" in result.counts else ""
-            row += [f"{result.steps:,}", *(scores or [""] * len(TABLE_COLUMNS)), hours]
-        lines.append(f"| {' | '.join(row + [''] * (len(head) - len(row)))} |")
+            row[2] = f"{result.steps:,}"
+            if result.evaluation:
+                row[3:9] = [f"{result.evaluation[f'evaluation/{point}']:,.0f}" for point in TABLE_COLUMNS]
+            if "hours" in result.counts:
+                row[9] = f"{result.counts['hours']:.2f}"
+        lines.append(f"| {' | '.join(row)} |")
         if folder.state == "failed":
             told = f" (`{TRACEBACK}` of the run tells all)" if (folder.path / TRACEBACK).exists() else ""
             failures.append(f"- **{job.title} failed**: {folder.error}{told}")
-    groups = [
-        f"| {name} | {len(means)} | {np.mean(means):,.0f} | {min(means):,.0f} | {max(means):,.0f} |"
-        for name, (_, means) in _evaluations(jobs, folders).items()
-    ]
-    summary = ["| group | runs | mean of the means | lowest | highest |\n| --- | ---: | ---: | ---: | ---: |", *groups]
-    parts = [
-        fitted(summary, NOTE_LENGTH // 4, "`runs.csv`") if groups else "",
-        fitted(failures, NOTE_LENGTH // 4, "`runs.csv`"),
-        "Figures: `curves.png`, `scores.png`.",
-    ]
-    above = "\n\n".join(part for part in parts if part)
-    journal.note(f"{above}\n\n{fitted(lines, NOTE_LENGTH - len(above), '`runs.csv`')}")
+    above = fitted(failures, NOTE_LENGTH // 4, "`runs.csv`") + "\n\n"
+    journal.note(f"{above}{fitted(lines, NOTE_LENGTH - len(above), '`runs.csv`')}".strip())
     journal.flush()
 
 
-def _draw(journal: Journal, jobs: Sequence[Job], folders: Sequence[RunFolder], was_complete: bool) -> None:
-    """Write the sweep's figures and its table of numbers; the figures also as pictures once all runs have ended."""
-    is_complete = all(folder.state == "done" for folder in folders)
-    trained: dict[str, tuple[str, list[list[tuple[float, float]]]]] = {}
-    for job, folder in zip(jobs, folders, strict=True):
-        trained.setdefault(job.group, (job.colour, []))[1].append(_curve(folder, "score/mean_100"))
-    figures = {"curves": curves(trained, "step", "score, mean of 100 episodes")}
-    if evaluated := _evaluations(jobs, folders):
-        figures["scores"] = strips(evaluated, "mean score of the last evaluation, a dot a run")
-    for name, picture in figures.items():
-        journal.artifact(f"{name}.png", picture)
-        if is_complete and not was_complete:
-            journal.image(f"sweep/{name}", picture, 0)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
+def _tabulate(journal: Journal, runs: Runs) -> None:
+    """Write all numbers of the sweep's runs."""
     rows: list[dict[str, Any]] = []
-    for job, folder in zip(jobs, folders, strict=True):
+    for folder, job in runs.items():
         result = folder.result
         numbers = {"steps": result.steps, **result.counts, **result.evaluation} if result else {}
         rows.append({"run": folder.name, "title": job.title, "state": folder.state, **numbers})
-    head = list(dict.fromkeys(key for row in rows for key in row))
-    writer.writerow(head)
-    writer.writerows([row.get(key, "") for key in head] for row in rows)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
     journal.artifact("runs.csv", text.getvalue().encode())
-
-
-def _evaluations(jobs: Sequence[Job], folders: Sequence[RunFolder]) -> dict[str, tuple[str, list[float]]]:
-    """The colour of each group and the evaluated means of its runs."""
-    groups: dict[str, tuple[str, list[float]]] = {}
-    for job, folder in zip(jobs, folders, strict=True):
-        if (result := folder.result) is not None and result.evaluation:
-            groups.setdefault(job.group, (job.colour, []))[1].append(result.evaluation["evaluation/mean"])
-    return groups
-
-
-def _curve(folder: RunFolder, key: str) -> list[tuple[float, float]]:
-    with suppress(ValueError, OSError):  # of a journal that was damaged: the run's own command says so
-        return [(record.step, record.values[key]) for record in curve(folder.path, [key])]
-    return []

@@ -1,8 +1,6 @@
 """A training as a session: opened, run, closed; the same job again continues it, or reports how it has ended."""
 
 import dataclasses
-import os
-import platform
 import signal
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -16,13 +14,14 @@ from atlantis_exp import terminal
 from atlantis_exp.build import build_trained_network, build_trainer, choose_device, described, import_components
 from atlantis_exp.checking import flatten, to_dict
 from atlantis_exp.config import Config
-from atlantis_exp.faults import ConfigError, Fault, RunFault
+from atlantis_exp.faults import ConfigError, Fault, RunFault, remedied
 from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import CONFIG, LOST, TRACEBACK, Result, RunFolder, all_runs
 from atlantis_exp.runs.journal import Journal, adopt, has_lost_commit
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.cards import read_card
 from atlantis_exp.sessions.job import Job, labels
+from atlantis_exp.sessions.processor import processor_name, set_up_torch
 from atlantis_exp.sessions.stopping import StopRequest, sweep_goes_on
 from atlantis_exp.tracking.publishing import catch_up, publishing
 from atlantis_exp.training.checkpoint import unforged
@@ -50,13 +49,16 @@ def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int |
     if _has_ended(job, folder):
         return None
     progress = Progress()
-    stop = StopRequest(config.budget.seconds, sweep_goes_on(folder, job.launcher))
+    stop = StopRequest(
+        config.budget.seconds, sweep_goes_on(folder, job.launcher), job.machine.slurm_restarts is not None
+    )
     tracking = config.tracking if job.launcher is None else dataclasses.replace(config.tracking, name="none")
     about = f"Network `{config.model.name}` on {config.env.id}, seed {config.seed}. Continue or report: `{job.command}`"
     with folder.held(), stop.installed(), publishing(folder, tracking, job.outputs, _labels(job)) as journal:
         with _faults_recorded(job, folder, journal), closing(progress):
             with terminal.working("making the network and the emulators"):
-                trainer = build_trainer(config, folder.path, journal, progress, about)
+                set_up_torch(config, config.device)
+                trainer = build_trainer(config, job.machine.cores, folder.path, journal, progress, about)
             with trainer.emulators:
                 _open(trainer, job, folder, journal, progress)
                 watched = partial(watch, trainer)
@@ -92,7 +94,7 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
     if config.resume == "must" and not folder.has_started:
         raise ConfigError(f"resume=must: there is no run {folder.name} under {job.outputs / 'runs'}")
     # A sweep's launcher has put aside what was there, and its next try of a job, as Slurm's, is no new run.
-    is_first = job.launcher is None and os.environ.get("SLURM_RESTART_COUNT", "0") == "0"
+    is_first = job.launcher is None and not job.machine.slurm_restarts
     if config.resume == "never" and is_first and folder.has_started:
         parent = folder.parent
         print(f"the run that was here is kept as {folder.put_aside()}")
@@ -140,8 +142,6 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
     if state is not None:
         with unforged(folder.checkpoints):
             done = Counters.of(state["counters"])
-            if not 0 <= done.episodes <= done.steps < 2**53:
-                raise ValueError(f"{done.episodes} episodes in {done.steps} steps")
     if state is None:
         if (weights := _initial_weights(config)) is not None:
             trainer.learner.begin_with(weights)
@@ -165,21 +165,11 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
     facts = {
         "device": str(trainer.learner.device),
         "precision": str(trainer.learner.dtype).removeprefix("torch."),
-        "processor": _processor(trainer.learner.device),
+        "processor": processor_name(trainer.learner.device),
         "threads": str(trainer.learner.shards * torch.get_num_threads()),
     }
     journal.tags({**provenance(job.command), **facts})
     journal.status("RUNNING")
-
-
-def _processor(device: torch.device) -> str:
-    """What a device computes on, as its maker calls it; a CPU with its instructions, on which the last bits depend."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    name = platform.processor() or platform.machine()  # Linux has no model in either
-    with suppress(OSError), open("/proc/cpuinfo") as lines:
-        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
-    return f"{name}, {torch.backends.cpu.get_cpu_capability()}"
 
 
 def _changed_plugins(config: Config, folder: RunFolder) -> str:
@@ -229,7 +219,7 @@ def _faults_recorded(job: Job, folder: RunFolder, journal: Journal) -> Iterator[
             write_file(folder.path / TRACEBACK, traceback.format_exc().encode())
             journal.status("FAILED", str(error) or type(error).__name__)
         if isinstance(error, RunFault | OSError):
-            raise Fault(f"run {folder.name}: {error}; continue with: {job.command}") from error
+            raise Fault(f"run {folder.name}: {remedied(error)}; continue with: {job.command}") from error
         if job.config.compile and _is_of_compilation(error):
             reason = str(error).strip().partition("\n")[0]
             raise Fault(f"run {folder.name}: torch.compile failed, {reason}; compile=false does without") from error

@@ -1,6 +1,7 @@
 """Is a training that is killed again and again the unbroken one?"""
 
 import json
+import math
 import os
 import random
 import shutil
@@ -22,12 +23,13 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.job import Job, command_line, labels, replaced
-from atlantis_exp.sessions.sweep import terminable
+from atlantis_exp.sessions.page import terminable
 from atlantis_exp.tracking.publishing import publishing
 from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.fingerprint import fingerprint
 
 _KILLS = 3
+_EARLY_SECONDS = 10.0  # that a session takes to start
 _SAID, _SAYS = "stderr.txt", "stdout.txt"  # of the latest session
 
 
@@ -97,14 +99,17 @@ def start(command: Sequence[str], said: Path) -> Session:
 
 
 @terminable()
-def run_and_kill(start: Callable[[Path], Session], outputs: Path, runs: str, kills: int, seconds: float = 1.0) -> int:
-    """Start sessions that write runs under `outputs` until one ends by itself; returns how many kills struck.
+def run_and_kill(
+    start: Callable[[Path], Session], outputs: Path, runs: str, kills: int, seconds: float = 1.0, early: float = 0.0
+) -> int:
+    """Start sessions that write runs under `outputs` until one ends by itself; return how many kills struck.
 
     Up to `kills` times, a session's process group gets a SIGKILL at a random moment within some seconds of a commit.
 
     Args:
         start: starts a session, the leader of a process group, whose errors go to the file that is handed in.
         runs: the pattern of the runs' names.
+        early: the share of kills at a random moment of a session's first `_EARLY_SECONDS` instead.
 
     Raises:
         Fault: a session ended with an error.
@@ -114,9 +119,12 @@ def run_and_kill(start: Callable[[Path], Session], outputs: Path, runs: str, kil
     while True:
         before = generations(outputs, runs)
         session = start(outputs / _SAID)
+        moment = time.monotonic() + random.random() * _EARLY_SECONDS if random.random() < early else math.inf
         try:
             while struck < kills and session.poll() is None:
                 time.sleep(0.01)
+                if time.monotonic() > moment:
+                    break
                 if generations(outputs, runs) > before:
                     time.sleep(random.random() * seconds)
                     break

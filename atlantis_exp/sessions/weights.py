@@ -5,12 +5,13 @@ from atlantis_exp.runs.files import ARTIFACT, is_whole, read_file
 from atlantis_exp.runs.folder import NETWORK, RunFolder
 from atlantis_exp.runs.journal import Model, model_file
 from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints, to_safetensors, unforged
+from atlantis_exp.training.plan import Counters
 
 
 def stored_weights(run: RunFolder, weights: str) -> tuple[bytes, int]:
     """A stored run's network as safetensors, and its step; weights: `latest` or `best`.
 
-    A folder without checkpoints, as one that was brought from a server, has the weights of its evaluations.
+    A folder without checkpoints, as one that was copied without them, has the weights of its evaluations.
 
     Raises:
         Fault: where the run has no such weights, or they are not those that were committed.
@@ -28,8 +29,8 @@ def stored_weights(run: RunFolder, weights: str) -> tuple[bytes, int]:
     with unforged(run.checkpoints):
         if weights == "latest":
             learner = state["learner"]
-            return to_safetensors(learner.get("evaluated", learner["network"])), int(state["counters"]["steps"])
-        step = int(state["best_step"])
+            return to_safetensors(learner.get("evaluated", learner["network"])), Counters.of(state["counters"]).steps
+        step = min(int(state["best_step"]), Counters.of(state["counters"]).steps)
     if step < 0:
         raise Fault(f"run {run.name} has no evaluation yet, so no best weights; weights=latest has some")
     return _read(run, model_file(NETWORK, step), state.get("best_sha256", "")), step

@@ -4,7 +4,7 @@ import os
 from typing import TYPE_CHECKING
 
 from atlantis_exp.faults import Fault
-from atlantis_exp.registry import Game
+from atlantis_exp.games import Game
 
 if TYPE_CHECKING:
     from atlantis_exp.game.preprocessing import Pixels

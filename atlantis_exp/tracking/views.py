@@ -5,10 +5,14 @@ A shared view is a tag of the experiment in a format that MLflow keeps to itself
 
 import base64
 import json
+import os
+import warnings
 import zlib
+from pathlib import Path
 from typing import Any
 
 from atlantis_exp.runs.journal import NOTE
+from atlantis_exp.tracking.local import uri_of
 
 _SECTIONS = {  # cards a row, and their height in pixels
     "evaluation": (2, 360),
@@ -70,6 +74,22 @@ def address(server: str, experiment_id: str, view: str) -> str:
         f"{server}/#/experiments/{experiment_id}/runs?workflowType=machine_learning&compareRunsMode={mode}"
         f"&viewStateShareKey={view}"
     )
+
+
+def site(outputs: Path, start: str) -> Any:
+    """Return MLflow's server on the store of an outputs folder, whose plain address leads to `start`."""
+    os.environ["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] = "false"  # ten processes otherwise
+    os.environ["_MLFLOW_SERVER_FILE_STORE"] = uri_of(outputs.resolve())  # read by the import: this is a server
+    from mlflow.server import app as pages
+
+    with warnings.catch_warnings(action="ignore"):  # of a library that MLflow will replace
+        from mlflow.server.fastapi_app import app
+
+    # What is behind '#' is not sent to a server: the page itself has to look.
+    lead = f"<head><script>if (!location.hash) location.replace({json.dumps(start)})</script>"
+    index = Path(str(pages.static_folder), "index.html").read_text().replace("<head>", lead, 1)
+    pages.view_functions["serve"] = lambda: index
+    return app
 
 
 def _start_here() -> dict[str, Any]:

@@ -22,7 +22,7 @@ from atlantis_exp.runs.files import CHECKPOINT, SMALL, inside, read_file, read_o
 FORMAT = 1
 _SEGMENTS = 64  # of a full memory, about
 _DAMAGED = (
-    *(OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RuntimeError),
+    *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
     SafetensorError,
 )
 """What comes of a state that is not what was saved."""
@@ -139,6 +139,8 @@ class Checkpoints:
                     memory.load_segments(self._read(entry["name"], entry["sha256"]) for entry in segments)
                 elif memory is not None:
                     segments = self._load_what_is_left(memory, segments)
+                if memory is not None and segments and segments[-1]["next_id"] != memory.next_id:
+                    raise ValueError("its manifest and its replay memory end at different observations")
             except CheckpointError:
                 raise
             except MemoryError:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.game.vector import Emulators
-from atlantis_exp.registry import Game
+from atlantis_exp.games import Game
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.statistics import Summary, summarize
 from atlantis_exp.training.actor import Actor, Decisions
@@ -36,6 +36,7 @@ class Episode:
     rewards: "array[float]" = field(default_factory=lambda: array("f"))  # one a step
     raw_values: bytearray = field(default_factory=bytearray)  # of `values`
     points: list[float] = field(default_factory=list)  # the score, in the order of the game's sources
+    over: bool = False
 
     @property
     def steps(self) -> int:
@@ -193,19 +194,19 @@ def evaluate(
     seed: int,
     size: int,
     stack: int,
-    on_step: Callable[[Sequence[Episode], int], None] = lambda *_: None,
+    on_step: Callable[[Sequence[Episode]], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Evaluation:
     """Play `episodes` episodes side by side; what each is like depends on `seed` and its own index alone.
 
     The environments are two halves: while one is emulated, the actor decides for the other. size in pixels and stack in
-    observations, as the actor's states want them. on_step is called with all episodes, and how many of them are over,
-    after every step of a half.
+    observations, as the actor's states want them. on_step is called with all episodes after
+    every step of a half.
 
     Raises:
         Stopped: when `stop`, which is asked before every step is received, says so.
     """
-    game = emulators.game
+    game, emulators.stop = emulators.game, stop
     played = [
         Episode(_seed_sequence(seed, index).generate_state(1).item(), points=[0.0] * len(game.sources))
         for index in range(episodes)
@@ -215,7 +216,6 @@ def evaluate(
     waiting = iter(range(episodes))
     playing: dict[int, int] = {}  # environment to the episode it plays
     under_way: deque[tuple[range, npt.NDArray[np.int64], Decisions]] = deque()  # each with the half that it is of
-    over = 0  # episodes
 
     def begin(envs: Sequence[int]) -> None:
         for env in envs:
@@ -257,12 +257,11 @@ def evaluate(
                 ]
             episode.frames += int(steps.frames[row])
             if steps.terminated[row] or steps.truncated[row]:
-                episode.truncated = bool(steps.truncated[row])
+                episode.over, episode.truncated = True, bool(steps.truncated[row])
                 ended.append(env)
-        over += len(ended)
         begin(ended)
         decide(half)
-        on_step(played, over)
+        on_step(played)
     return Evaluation(epsilon, played, game)
 
 

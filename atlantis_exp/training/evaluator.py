@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.vector import Emulators
@@ -22,6 +23,7 @@ class Evaluator:
     num_envs: int  # episodes played side by side
     size: int  # pixels
     stack: int  # observations
+    most_frames: int  # an episode
     video: Part | None  # what is filmed of the best episode
 
     def __call__(
@@ -48,7 +50,7 @@ class Evaluator:
                 seed=self.seed,
                 size=self.size,
                 stack=self.stack,
-                on_step=progress.evaluating,
+                on_step=partial(progress.evaluating, most_frames=self.most_frames),
                 stop=stop,
             )
 

@@ -8,13 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from atlantis_exp.game.emulator import Emulator
-from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.media import film, scene
-from atlantis_exp.training.actor import States
 from atlantis_exp.training.evaluation import Episode
 
 Part = Literal["first_minute", "best_minute", "all"]
-QValues = Callable[[States], npt.NDArray[np.float32]]
 
 FRAMES_A_MINUTE = 3_600  # of the game
 
@@ -42,24 +39,6 @@ def moments(episode: Episode, emulator: Emulator, start: int = 0) -> Iterator[Mo
         step = emulator.step(action)
         score += step.reward
         frame += step.frames
-    yield Moment(emulator.screen_rgb(), score, frame, None, False, None)
-
-
-def greedy_moments(seed: int, emulator: Emulator, stack: int, q_values: QValues) -> Iterator[Moment]:
-    """Play an episode by the network's best actions alone; stack in observations, as the network wants its states."""
-    observation = emulator.reset(seed)
-    stacks = FrameStack(1, observation.shape[0], stack)
-    stacks.reset([0], observation[np.newaxis])
-    score, frame, over = 0.0, 0, False
-    while not over:
-        values = q_values(stacks.state)[0]
-        action = int(values.argmax())
-        yield Moment(emulator.screen_rgb(), score, frame, action, False, values)
-        step = emulator.step(action)
-        stacks.push(step.observation[np.newaxis])
-        score += step.reward
-        frame += step.frames
-        over = step.terminated or step.truncated
     yield Moment(emulator.screen_rgb(), score, frame, None, False, None)
 
 

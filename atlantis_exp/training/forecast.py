@@ -31,6 +31,7 @@ class Forecast:
     disk_available: int  # bytes
     held: float = math.inf  # observations that the replay memory's bytes will hold
     learn_start: int = 0  # transitions
+    updates_per_second: float = math.nan
 
     @property
     def hours(self) -> float:
@@ -125,6 +126,7 @@ def forecast(
     evaluations += steps / emulators.game.episode_steps / (cadence.evaluate_episodes or math.inf)
     return Forecast(
         steps_per_second=1 / seconds_a_step,
+        updates_per_second=1 / update_seconds,
         steps=steps,
         memory=more_bytes + _WARM_MEMORY,
         memory_available=psutil.virtual_memory().available,

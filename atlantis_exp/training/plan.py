@@ -2,30 +2,37 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field
 
 from atlantis_exp.learning.schedules import Schedule
 from atlantis_exp.replay.memory import Returns
 from atlantis_exp.replay.samplers import Sampler
+from atlantis_exp.runs.files import checked
 
 Unit = Literal["episodes", "steps"]
+Count = Annotated[int, Field(ge=0, lt=2**53)]
 
 
 @dataclass
 class Counters:
     """What was done so far, over all sessions."""
 
-    steps: int = 0
-    frames: int = 0
-    episodes: int = 0
-    random: int = 0  # decisions that chance took
-    learn_ticks: int = 0  # multiples of learn_every that have passed
-    seconds: float = 0.0
+    steps: Count = 0
+    frames: Count = 0
+    episodes: Count = 0
+    random: Count = 0  # decisions that chance took
+    learn_ticks: Count = 0  # multiples of learn_every that have passed
+    seconds: Annotated[float, Field(ge=0, lt=1e12)] = 0.0
 
     @classmethod
     def of(cls, saved: Mapping[str, Any]) -> Self:
-        """Counters as a checkpoint has them. Raises: KeyError."""
-        return cls(**{field.name: saved[field.name] for field in fields(cls)})
+        """Return the counters that a checkpoint holds. Raises: KeyError, TypeError, ValueError."""
+        counters = checked(cls, {field.name: saved[field.name] for field in fields(cls)})
+        if counters.episodes > counters.steps:
+            raise ValueError(f"{counters.episodes} episodes in {counters.steps} steps")
+        return counters
 
 
 @dataclass(frozen=True)

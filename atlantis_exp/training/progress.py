@@ -85,6 +85,9 @@ class Progress:
     def __init__(self, console: Console | None = None) -> None:
         self.console = console or terminal.console()
         self._shown: float | None = None  # time
+        self._lines = 0  # since the first one fell due
+        self._evaluated: Sequence[Episode] | None = None  # under way
+        self._began = 0.0  # time, of that
         self._live: Live | None = None
 
     def say(self, text: str) -> None:
@@ -99,10 +102,10 @@ class Progress:
 
     def show(self, snapshot: Snapshot) -> None:
         """Draw a training's bar, or write its line."""
-        self._shown = time.monotonic()
         if not self.console.is_terminal:
-            self.say(_line(snapshot))
+            self._write(_line(snapshot))
             return
+        self._shown = time.monotonic()
         table = Table.grid(padding=(0, 1))
         table.add_row(ProgressBar(total=1.0, completed=snapshot.share, width=24), _line(snapshot))
         if self._live is None:
@@ -110,20 +113,27 @@ class Progress:
             self._live.start()
         self._live.update(table, refresh=True)
 
-    def evaluating(self, episodes: Sequence["Episode"], over: int) -> None:
-        """To be called after every step of an evaluation: writes a line now and then. Good games last for minutes."""
+    def evaluating(self, episodes: Sequence["Episode"], most_frames: int) -> None:
+        """To be called after every step of an evaluation: writes a line now and then.
+
+        Good games last for minutes, and none for more than `most_frames`: so long it takes at most.
+        """
+        if self._evaluated is not episodes:
+            self._evaluated, self._began = episodes, time.monotonic()
         if self._is_time_for_a_line():
-            self._shown = time.monotonic()
             steps, high = sum(episode.steps for episode in episodes), max(episode.score for episode in episodes)
-            self.say(
-                f"  evaluation: {over} of {len(episodes)} episodes over, {steps:,} steps, highest score {high:,.0f}"
+            frames = sum(most_frames if episode.over else episode.frames for episode in episodes)
+            left = (most_frames * len(episodes) / frames - 1) * (time.monotonic() - self._began)
+            over = sum(episode.over for episode in episodes)
+            self._write(
+                f"  evaluation: {over} of {len(episodes)} episodes over, {steps:,} steps, highest score {high:,.0f}, "
+                f"at most {terminal.clock(left)} left"
             )
 
     def filming(self, drawn: int, pictures: int) -> None:
         """To be called with every picture of a film: writes a line now and then."""
         if self._is_time_for_a_line():
-            self._shown = time.monotonic()
-            self.say(f"  film: {drawn:,} of {pictures:,} steps")
+            self._write(f"  film: {drawn:,} of {pictures:,} steps")
 
     def evaluated(self, step: int, frames: int, evaluation: "Evaluation") -> None:
         """To be called after every evaluation of a training, with its step and the frames that were trained for."""
@@ -145,7 +155,12 @@ class Progress:
     def _is_time_for_a_line(self) -> bool:
         if self._shown is None:  # the first one comes when there is something to tell
             self._shown = time.monotonic()
-        return time.monotonic() - self._shown >= terminal.LINE_SECONDS
+        return time.monotonic() - self._shown >= terminal.until_line(self._lines)
+
+    def _write(self, line: str) -> None:
+        self._shown = time.monotonic()
+        self._lines += 1
+        self.say(line)
 
     def close(self) -> None:
         """End the bar."""

@@ -6,16 +6,18 @@ Nothing of it is learned from. A metric of the training is added in `Recorder.cu
 
 import hashlib
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from atlantis_exp.faults import Fault
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.media import score_heatmap, score_histogram
-from atlantis_exp.registry import TABLE_COLUMNS
 from atlantis_exp.replay.memory import ReplayMemory
-from atlantis_exp.runs.folder import BEST_EPISODE, EPISODES, NETWORK, evaluation_at
+from atlantis_exp.runs.files import checked
+from atlantis_exp.runs.folder import BEST_EPISODE, EPISODES, EVALUATED, NETWORK, TABLE_COLUMNS, evaluation_at
 from atlantis_exp.runs.journal import Tracker
 from atlantis_exp.training.checkpoint import to_safetensors
 from atlantis_exp.training.evaluation import Evaluation, Stopped
@@ -38,6 +40,20 @@ class Played(NamedTuple):
     score: float
     length: int  # steps
     env: int
+
+
+@dataclass(frozen=True)
+class _Saved:
+    """The evaluations so far, as a recorder's state holds them."""
+
+    best_mean: float | None
+    evaluations: Annotated[int, Field(ge=0, lt=2**53)]
+    evaluated_at: Annotated[int, Field(ge=-1, lt=2**53)]
+    owes_evaluation: bool
+    best_step: Annotated[int, Field(ge=-1, lt=2**53)]
+    last_report: str
+    last_metrics: dict[str, int | float]  # as they were, for resume is bit for bit
+    best_sha256: str = ""  # 0.1.0 has none
 
 
 class Diverged(Fault):
@@ -225,11 +241,16 @@ class Recorder:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         for episode, step, frames, score, length, env in state["episodes"].tolist():
             self.episodes.append(Played(int(episode), int(step), int(frames), score, int(length), int(env)))
-        self.best_mean = -np.inf if state["best_mean"] is None else state["best_mean"]
-        self.evaluations, self.evaluated_at = state["evaluations"], state["evaluated_at"]
-        self.evaluation_pending, self.best_step = state["owes_evaluation"], state["best_step"]
-        self.best_sha256 = state.get("best_sha256", "")  # 0.1.0 has none
-        self.last_report, self.last_metrics = state["last_report"], state["last_metrics"]
+        if not np.isfinite(self.recent_scores(len(self.episodes))).all():
+            raise ValueError("the scores are not finite")
+        saved = checked(_Saved, state)
+        self.best_mean = -np.inf if saved.best_mean is None else saved.best_mean
+        self.evaluations, self.evaluated_at = saved.evaluations, saved.evaluated_at
+        self.evaluation_pending, self.best_step = saved.owes_evaluation, saved.best_step
+        self.best_sha256 = saved.best_sha256
+        self.last_report, self.last_metrics = saved.last_report, saved.last_metrics
+        if self.last_metrics and (missing := EVALUATED - self.last_metrics.keys()):
+            raise ValueError(f"the last evaluation lacks {min(missing)}")
         self.tracker.load_state_dict(state["tracker"])
 
     def _write_episodes(self) -> None:

@@ -61,10 +61,11 @@ class Trainer:
 
         Raises:
             Diverged: when the loss is no finite number; nothing is committed then.
-            WorkerDied: when an emulator's process has ended.
+            WorkerDied: when an emulator's process has ended or hangs; the last commit stays.
             OSError: when a commit cannot be written; the last one stays.
         """
         overlap = self.emulators.num_envs > 1  # learn while they play
+        self.emulators.stop = stop
         self._begin(stop)
         while not self.has_ended and not stop():
             sampler = self.plan.phase_at(self.counters).sampler
@@ -108,6 +109,11 @@ class Trainer:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.counters = Counters.of(state["counters"])
+        due = self.counters.steps // self.plan.learn_every - self.counters.learn_ticks
+        if not 0 <= due <= self.emulators.num_envs:  # else the next step would make all these updates
+            raise ValueError(f"{due} updates are due")
+        if self.memory.highest_action >= len(self.emulators.game.actions):
+            raise ValueError(f"the replay memory holds action {self.memory.highest_action}, which the game lacks")
         self.learner.load_state_dict(state["learner"])
         self.emulators.load_state_dict(state["emulators"])
         self.stack.load_state_dict(state["stack"])
@@ -116,7 +122,9 @@ class Trainer:
         self.sampling.bit_generator.state = state["sampling"]
         for index, phase in enumerate(self.plan.phases):
             phase.sampler.load_state_dict(state["samplers"][str(index)])
-        self.scores, self.lengths = state["scores"], state["lengths"]
+        self.scores[:], self.lengths[:] = state["scores"], state["lengths"]
+        if not np.isfinite(self.scores).all():
+            raise ValueError("the scores are not finite")
         self.recorder.load_state_dict(state)
         for env in range(self.emulators.num_envs):
             if not self.memory.is_under_way(env):  # what came before in its episode was lost

@@ -1,9 +1,12 @@
 """The edge: exit codes, what is printed where, and what a command line may leave behind."""
 
 import os
+import random
 import re
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +18,7 @@ from atlantis_exp.commands import VERBS
 from atlantis_exp.commands.composing import checked
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.config import Config
+from atlantis_exp.sessions.job import replaced
 
 REPOSITORY = Path(__file__).parents[2]
 Command = Callable[..., int]
@@ -70,15 +74,17 @@ def test_a_process_ends_as_its_command_line_does(tmp_path: Path) -> None:
     "verb",
     [pytest.param(verb, marks=() if verb in ("", "compare") else pytest.mark.slow) for verb in ("", *VERBS)],
 )
-def test_help_says_what_the_verb_does_and_which_verbs_there_are(
+def test_help_says_what_a_verb_does_and_without_one_which_there_are(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], verb: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert command(*([verb] if verb else []), "--help") == 0
     first, second, *others = capfd.readouterr().out.splitlines()
-    assert first == f"python -m atlantis_exp {verb or 'train'} KEY=VALUE ..."
-    assert second == VERBS[verb or "train"]
-    assert all(any(purpose in line for line in others) for purpose in VERBS.values())
+    assert first == f"python -m atlantis_exp {verb or '[VERB]'} KEY=VALUE ..."
+    if verb:
+        assert second == VERBS[verb]
+    else:
+        assert all(any(purpose in line for line in others) for purpose in VERBS.values())
     assert list(tmp_path.iterdir()) == []
 
 
@@ -121,6 +127,40 @@ def test_nothing_heavy_is_loaded_before_the_config_is_checked() -> None:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     heavy = {"torch", "mlflow", "ale_py", "gymnasium", "cv2", "matplotlib", "scipy", "av", "numpy"}
     assert heavy & set(done.stdout.split()) == set()
+
+
+@pytest.mark.slow  # on a busy machine one of a few interrupts was still lost on 2026-11-28: the cause is not found yet
+@pytest.mark.parametrize("moments", [4, pytest.param(300, marks=pytest.mark.timeout(6_000))])
+def test_an_interrupt_at_any_moment_of_the_start_ends_a_training(
+    tiny_overrides: tuple[str, ...], tmp_path: Path, moments: int
+) -> None:
+    """Some libraries swallow a KeyboardInterrupt, as pydantic does where it builds a schema."""
+    program = "from atlantis_exp.commands import main; print('up', flush=True); main()"
+    words = replaced(tiny_overrides, "phase.quick.steps=100_000")
+    rng, longest = random.Random(0), 0.0
+    for moment in range(-1, moments):
+        training = subprocess.Popen(
+            (sys.executable, "-c", program, *words, f"paths.outputs={tmp_path / str(moment)}"),
+            cwd=REPOSITORY,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert training.stdout is not None
+        assert training.stdout.readline() == "up\n"
+        began = time.monotonic()
+        if moment < 0:  # how long a start takes here
+            while not training.stdout.readline().startswith("starting run"):
+                assert training.poll() is None
+            longest = time.monotonic() - began
+        else:
+            time.sleep(rng.uniform(0, longest))
+        training.send_signal(signal.SIGINT)
+        _, error = training.communicate(timeout=120)
+        assert training.returncode in (130, -signal.SIGINT), error  # the latter before there is a handler
+        if training.returncode == 130:
+            assert "Traceback" not in error
+            assert re.search("atlantis_exp: (interrupted|SIGINT: run .* is committed)", error)
 
 
 def test_an_interrupt_while_a_verb_is_imported_is_one_line(

@@ -43,10 +43,18 @@ Command = Callable[..., int]
         ),
         (("model=cnn,resnet", "delta=5pt"), "delta=5pt: write a share of a score, as in delta=5%, or points"),
         (("model=cnn,resnet", "seeds=4"), "seeds=4: should be greater than or equal to 5"),
-        (("model=cnn,resnet", "error=0"), "error=0: should be greater than 0"),
+        (("model=cnn,resnet", "error=0"), "error=0: should be greater than or equal to 1e-06"),
         (("model=cnn,resnet", "look=now"), "look=now: no such key"),
         (("model=cnn,resnet", "evaluation.at_end=false"), "evaluation.at_end=false: contenders are compared by the "),
-        (("model=cnn,resnet", "hydra/launcher=joblb"), "In 'hydra/config': Could not find 'hydra/launcher/joblb'"),
+        (
+            ("model=cnn,resnet", "hydra/launcher=joblb"),
+            "hydra/launcher=joblb: no such launcher; did you mean",
+        ),
+        (("model=cnn,resnet", "against=env.stack=2"), "model=cnn,resnet: several values, and against= as well; write"),
+        (("against=seed=3,model=cnn",), "seed: says how contenders are trained or measured, not what they are; one"),
+        (("against=model=cnn",), "model=cnn: the same contender as the config without it"),
+        (("against=model=rsenet",), "model=rsenet: no such option in conf/model; did you mean 'resnet'?"),
+        (("against=model",), "'model' is no override; write KEY=VALUE, as in model=resnet"),
         (("model=glob(*)",), "model=glob(*): no list of values; write them out"),
     ],
 )
@@ -65,8 +73,8 @@ def test_a_question_that_cannot_be_decided_is_one_line_and_code_2_and_leaves_not
     ("words", "reason"),
     [
         ("model=cnn model=cnn,resnet", "model=cnn,resnet: model=cnn says something else"),
-        ("model=cnn,resnet ++seed=3", "++seed=3: decide trains seeds from 0 on"),
-        ("model=cnn,resnet ++resume=never", "++resume=never: decide goes on"),
+        ("model=cnn,resnet ++seed=3", "seed=3: decide trains seeds from 0 on"),
+        ("model=cnn,resnet ++resume=never", "resume=never: decide goes on"),
     ],
 )
 def test_a_key_is_refused_however_it_is_written(words: str, reason: str) -> None:

@@ -4,12 +4,10 @@ import re
 from typing import Any
 
 import pytest
-from hydra import compose
 
 from atlantis_exp.commands import VERBS
 from atlantis_exp.commands.baseline import BaselineConfig
 from atlantis_exp.commands.compare import CompareConfig
-from atlantis_exp.commands.composing import composing
 from atlantis_exp.commands.evaluate import EvaluateConfig
 from atlantis_exp.commands.export import ExportConfig
 from atlantis_exp.commands.new import NewConfig
@@ -43,8 +41,8 @@ SCHEMAS: dict[str, type[Any]] = {
 MISTAKES = [  # what is written, and what the one line must hold
     # keys
     ("modle=cnn", "modle=cnn", "'model'"),
-    ("+modle=cnn", "+modle=cnn", "'model'"),
-    ("++modle=cnn", "++modle=cnn", "'model'"),
+    ("+modle=cnn", "modle=cnn", "'model'"),
+    ("++modle=cnn", "modle=cnn", "'model'"),
     ("lr=0.1", "lr=0.1", "'optimizer.lr'"),
     ("optimizer.l=1", "optimizer.l", "'optimizer.lr'"),
     ("++optimizer.l=1", "optimizer.l", "'optimizer.lr'"),
@@ -56,9 +54,8 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("model@foo=cnn", "model@foo", "'model'"),
     ("sampler@samplers.foo=uniform", "sampler@samplers.foo", "'sampler@samplers."),
     ("+samplers.mine={name:uniform}", "samplers.mine", "samplers.uniform"),
-    ("+optimizer.lr=0.1", "+optimizer.lr=0.1", "write optimizer.lr=0.1"),
     ("~optimizer.lr", "~optimizer.lr", "needed"),
-    ("~optimizer", "~optimizer", "adam, adamw, rmsprop"),
+    ("~optimizer", "~optimizer", "needed; write optimizer=VALUE"),
     ("~env.size", "~env.size", "needed"),
     ("~phase.single", "phase", "at least one phase"),
     ("phase=two_phase ~phase.first.lr", "phase.first.lr", "missing"),
@@ -83,8 +80,17 @@ MISTAKES = [  # what is written, and what the one line must hold
     # types and ranges
     ("optimizer.lr=abc", "optimizer.lr", "valid number"),
     ("optimizer.lr=true", "optimizer.lr", "valid number"),
-    ("optimizer.lr=0", "optimizer.lr=0", "greater than 0"),
-    ("optimizer.lr=-1", "optimizer.lr=-1", "greater than 0"),
+    ("optimizer.lr=0", "optimizer.lr=0", "greater than or equal to "),
+    ("optimizer.lr=-1", "optimizer.lr=-1", "greater than or equal to "),
+    ("optimizer.lr=1e300", "optimizer.lr=1e+300", "less than or equal to 10"),
+    ("phase.single.lr=1e300", "phase.single.lr=1e+300", "less than or equal to 10"),
+    ("optimizer.eps=1e300", "optimizer.eps=1e+300", "less than or equal to 1"),
+    ("optimizer=adamw optimizer.weight_decay=1e300", "optimizer.weight_decay=1e+300", "less than or equal to 1"),
+    ("objective.target.tau=1e-308", "objective.target.tau=1e-308", "greater than or equal to "),
+    ("objective.reward_scale=1e-308", "objective.reward_scale=1e-308", "greater than or equal to "),
+    ("training.ema=9223372036854775808", "training.ema=9223372036854775808", "less than or equal to 10000000"),
+    ("training.learn_start=9223372036854775808", "training.learn_start", "less than or equal to 1000000000000"),
+    ("lr_schedule=linear lr_schedule.duration=1e300", "lr_schedule.duration=1e+300", "less than or equal to 1000"),
     ("optimizer.lr=nan", "optimizer.lr", "finite"),
     ("optimizer.lr=${oc.env:HOME}", "optimizer.lr", "valid number"),
     ("optimizer.betas=[0.9]", "optimizer.betas.1", "missing"),
@@ -101,7 +107,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("objective.n_step=0", "objective.n_step=0", "greater than or equal to 1"),
     ("objective.reward_exponent=0", "objective.reward_exponent=0", "greater than 0"),
     ("objective.reward_exponent=1.5", "objective.reward_exponent=1.5", "less than or equal to 1"),
-    ("objective.reward_clip=0", "objective.reward_clip=0", "greater than 0"),
+    ("objective.reward_clip=0", "objective.reward_clip=0", "greater than or equal to "),
     ("objective.target.every=0", "objective.target.every=0", "greater than or equal to 1"),
     ("objective.quantiles=51", "objective.quantiles", "no such key"),
     ("objective.target.tau=2", "objective.target.tau=2", "less than or equal to 1"),
@@ -142,21 +148,19 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("seed=0,1", "seed=0,1", "-m"),
     ("seed=range(0,3)", "seed=range(0,3)", "-m"),
     ("--cfg job seed=0,1", "seed=0,1", "-m"),
-    ("--cfg job optimizer.lr=-1", "optimizer.lr=-1", "greater than 0"),
+    ("--cfg job optimizer.lr=-1", "optimizer.lr=-1", "greater than or equal to "),
     ("--cfg foo", "--cfg", "job"),
     ("--cfg", "--cfg", "argument"),
     ("-m model=cnn,resnt", "model=resnt", "'resnet'"),
     ("-m seed=0,1,-1", "seed=-1", "greater than or equal to 0"),
     ("-m model=cnn,resnet env.size=20,84", "env.size=20", "at least 36"),
-    ("model=cnn -m seed=0,1", "seed=0,1", "together"),
     ("--multi", "--multi", "'--multirun'"),
     ("--frobnicate", "--frobnicate", "no such flag"),
-    ("--config-name=query", "--config-name", "overrides"),
-    ("-cn query", "--config-name", "overrides"),
-    ("--config-path=/tmp", "--config-path", "overrides"),
+    ("--config-name=query", "--config-name=query: no such flag", "'--config-dir'"),
     ("--config-dir=/nowhere", "--config-dir=/nowhere", "no such folder"),
-    ("--experimental-rerun=x.pickle", "--experimental-rerun", "overrides"),
-    ("--info everything", "--info", "defaults"),
+    ("--info defaults", "--info: no such flag", "--cfg"),
+    ("--run", "--run: no such flag", "--cfg"),
+    ("--cfg job --hydra-help", "--hydra-help: no such flag", "--cfg"),
     # Hydra's own, which name code and places
     ("hydra.foo=1", "hydra.foo=1", "hydra/launcher=NAME"),
     ("-m seed=0,1 hydra/launcher=lsf", "hydra/launcher", "basic"),
@@ -169,12 +173,12 @@ MISTAKES = [  # what is written, and what the one line must hold
             *("hydra.sweeper._target_=os.system", "hydra.callbacks.x._target_=os.system", "hydra/sweeper=basic"),
             *("hydra.job_logging.version=1", "hydra.searchpath=[file:///tmp]", "hydra.run.dir=/tmp/x"),
             *("hydra.output_subdir=x", "hydra.job.chdir=true", "hydra.verbose=[a,b]", "hydra.sweep.dir=/tmp/x"),
-            *("~hydra.launcher", "hydra.launcher={a:1}", "hydra={verbose:true}", "+hydra={a:1}", "hydra=basic"),
+            *("~hydra.launcher", "hydra.launcher={a:1}", "hydra={verbose:true}", "hydra={a:1}", "hydra=basic"),
             "hydra/launcher@hydra.job_logging=basic",
         )
     ),
     ("--resolve", "--resolve", "--cfg job"),
-    ("--package optimizer", "--package", "--cfg job"),
+    ("--cfg job --package optimizer", "--package: no such flag", "--cfg"),
     # folders of a user whom the machine does not know
     ("paths.outputs='~nobodyhere/x'", "paths.outputs=~nobodyhere/x", "no such user"),
     ("plugins=['~nobodyhere/mynet.py']", "plugins=~nobodyhere/mynet.py", "no such user"),
@@ -192,14 +196,12 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("objective=quantile objective.quantiles=100000000", "objective.quantiles", "less than or equal to"),
     # a sweep has no one config to show
     ("--cfg job -m seed=0,1", "--cfg", "drop -m"),
-    ("--info config -m seed=0,1", "--info", "drop -m"),
     # writing
     ("model", "'model'", "KEY=VALUE"),
     ("env.crop=[1", "env.crop=[1", "KEY=VALUE"),
     ("sämpler=uniform", "sämpler=uniform", "quotes"),
     ("seed=☃", "seed=☃", "quotes"),
     ("seed='☃'", "seed=", "valid integer"),
-    ("+experiment=fast", "+experiment=fast", "write experiment=fast"),
     # other verbs
     ("query model=cnn", "model=cnn", "no such key"),
     ("evaluate model=1", "model=1", "no such key"),
@@ -216,8 +218,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("export too=pretrained/fast", "too=pretrained/fast", "'to'"),
     ("report paths.output=x", "paths.output", "'paths.outputs'"),
     ("new component.model=cnn to=x", "model=cnn", "built in"),
-    ("new component.model=MyNet to=x", "model=MyNet", "small letters"),
-    ("new component.model=none to=x", "model=none", "Python's own"),
+    ("new component.model=MyNet to=x", "model=MyNet", "lowercase letters"),
     ("new component.model=class to=x", "model=class", "Python's own"),
     ("ui port=80", "port=80", "greater than or equal to 1024"),
 ]
@@ -258,21 +259,13 @@ def test_a_plugin_of_an_unknown_user_is_one_line_before_hydra_reads_it() -> None
     ],
 )
 def test_a_sweep_that_cannot_be_is_one_line(line: str, reason: str) -> None:
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     with pytest.raises(ConfigError, match=f"^{re.escape(reason)}"):
         check("config", Config, ["-m", *line.split()])
 
 
-@pytest.mark.parametrize(("verb", "overrides"), [("query", []), ("new", []), ("config", ["paths.outputs=/o"])])
-def test_every_verb_s_sweep_has_a_folder(verb: str, overrides: list[str]) -> None:
-    with composing():
-        folder = compose(verb, overrides, return_hydra_config=True).hydra.sweep.dir
-    assert re.search(r"^/o/sweeps/" if overrides else r"outputs/sweeps/", folder)
-
-
-@pytest.mark.parametrize("line", ["seed=1 seed=2", "model=cnn model=resnet", "-m seed=0,1 seed=2", "seed=1 +seed=2"])
+@pytest.mark.parametrize("line", ["seed=1 seed=2", "model=cnn model=resnet", "-m seed=0,1 seed=2", "+seed=1 ++seed=2"])
 def test_a_key_given_twice_is_refused(line: str) -> None:
-    *_, first, second = line.split()
+    *_, first, second = (word.lstrip("+") for word in line.split())
     with pytest.raises(ConfigError, match=f"^{re.escape(second)}: {re.escape(first)} says something else"):
         refuse_twice(line.split())
     refuse_twice([first, first])
@@ -288,11 +281,12 @@ def test_a_key_given_twice_is_refused(line: str) -> None:
         "phase=two_phase ~phase.second",
         "optimizer.lr=1",
         "++optimizer.lr=1e-4",
+        "+optimizer.lr=1e-4 +model=resnet",
         "sampler@samplers.uniform=uniform",
         "env.frameskip=4 env.crop=[0,160,210,0] --cfg job --resolve",
         "paths.outputs='/tmp/ü und ü'",
         "device=cuda:1 threads=4",
-        "--help",
+        "model=cnn -m seed=0,1",
     ],
 )
 @pytest.mark.thinned(4)

@@ -45,7 +45,7 @@ def test_a_space_is_written_as_for_hydras_optuna_sweeper(text: str, drawn: BaseD
     [
         ("", "optimizer=adam,rmsprpo", "optimizer=rmsprpo: no such option in conf/optimizer; did you mean 'rmsprop'?"),
         ("", "optimizer.l=0.1,0.2", "did you mean 'optimizer.lr'?"),
-        ("", "optimizer.lr=interval(-1,1)", "optimizer.lr=-1.0: should be greater than 0"),
+        ("", "optimizer.lr=interval(-1,1)", "optimizer.lr=-1.0: should be greater than or equal to "),
         ("", "optimizer.lr=interval(2,1)", "`low <= high` must hold"),
         ("", "optimizer.lr=tag(log,interval(0,1))", "`low > 0` must hold"),
         ("", "optimizer.lr=range(1,1)", "there is no number in it"),
@@ -86,6 +86,7 @@ def test_an_impossible_space_is_refused_in_one_line_before_anything_starts(
         ("space.optimizer=adam,rmsprop optimizer=adam,adamw", "optimizer=adam,rmsprop says something else"),
         ("modle=cnn optimizer=adam,rmsprop", "did you mean 'model'?"),
         ("optimizer=adam,rmsprop evaluation.at_end=false", "evaluation.at_end=false: a search compares"),
+        ("optimizer=adam,rmsprop seed=3", "seed=3: write 1_000 or more; decide tests the best values with seeds below"),
         ("space=optimzer", "did you mean 'optimizer'?"),
     ],
 )

@@ -307,6 +307,18 @@ def test_equivalent_is_what_lies_within_delta() -> None:
     assert followed(rows, Plan(delta=1e-4, relative=True)).verdicts[0].said == "not decided"
 
 
+@pytest.mark.parametrize(
+    ("baseline", "share", "found"),
+    [("b", 0.090, "worse"), ("b", 0.092, "equivalent"), (None, 0.094, "worse"), (None, 0.096, "equivalent")],
+)
+def test_a_relative_delta_is_a_share_of_the_baselines_mean_or_else_of_the_pairs(
+    baseline: str | None, share: float, found: str
+) -> None:
+    rows = 1e-3 * drawn(0, 0) - np.array([[100.0], [110.0]])  # 10 is .0909 of b's mean, .0952 of both's, .1 of a's
+    verdict = followed(rows, Plan(delta=share, relative=True, baseline=baseline)).verdicts[0]
+    assert verdict.said == {"worse": "better"}.get(found, found)
+
+
 def test_with_delta_a_decided_pair_leaves_its_error_to_none() -> None:
     rows = drawn(0, 0, 50)
     (plain, *_), (strict, *_) = followed(rows).verdicts, followed(rows, Plan(delta=1e-3)).verdicts

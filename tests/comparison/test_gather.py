@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from atlantis_exp.comparison.gather import Player, gather, group, plays_alike, refuse_mixed_protocols, select
+from atlantis_exp.comparison.choosing import group, plays_alike, refuse_mixed_protocols, select
+from atlantis_exp.comparison.gather import Player, gather
 from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
@@ -104,7 +105,7 @@ def test_a_table_with_counts_that_are_no_numbers_is_named(
     header, first, *others = table.read_text().splitlines()
     cells = dict(zip(header.split(","), first.split(","), strict=True)) | {column: value}
     table.write_text("\n".join([header, ",".join(cells.values()), *others]))
-    assert "has a count that is no finite number" in gather(tmp_path).skipped[run.name]
+    assert "it has numbers beyond 1e15" in gather(tmp_path).skipped[run.name]
 
 
 def test_a_table_of_other_actions_is_named(recorded: Recorded, tmp_path: Path) -> None:
@@ -215,7 +216,7 @@ def test_a_player_is_shown_next_to_runs_whose_game_is_its_own_alone(recorded: Re
     still, sticky = (RunFolder(recorded(f"env.sticky={share}")).trained_config.env.sticky for share in ("0.0", "0.25"))
     gathered = gather(tmp_path)
     players = [
-        Player("random", {**gathered.trainings[0].config, "env.sticky": each}, gathered.trainings[0].episodes)
+        Player("random", {**gathered.trainings[0].config, "env.sticky": each}, {}, gathered.trainings[0].episodes)
         for each in (still, sticky)
     ]
     for player in players:
@@ -231,6 +232,7 @@ def test_a_film_is_of_the_episodes_that_count(recorded: Recorded, tmp_path: Path
     assert gather(tmp_path).trainings[0].film is None  # nobody says of which evaluation it is
     for step, shown in ((80, None), (160, film)):
         journal = Journal(own.path)
+        journal.resume()
         journal.tags({"best_evaluation": f"mean 1 at step {step}"})
         journal.finish()
         assert gather(tmp_path).trainings[0].film == shown
@@ -247,6 +249,7 @@ def test_runs_are_chosen_by_name_and_by_config(recorded: Recorded, tmp_path: Pat
     assert {run.config["model.name"] for run in gather(tmp_path, ["res"]).trainings} == {"resnet"}
     assert {run.config["seed"] for run in gather(tmp_path, ["*-s1-*"]).trainings} == {1}
     assert [run.name for run in gather(tmp_path, [everything[2].name]).trainings] == [everything[2].name]
+    assert [run.name for run in gather(tmp_path, [everything[2].name[:-3]]).trainings] == [everything[2].name]
     (one,) = select(everything, ["model=cnn", "seed=1"])
     assert (one.config["model.name"], one.config["seed"]) == ("cnn", 1)
     assert len(select(everything, ["replay.capacity=120", "env.max_pool=false"])) == 4
@@ -262,6 +265,28 @@ def test_runs_are_chosen_by_name_and_by_config(recorded: Recorded, tmp_path: Pat
         select(everything, ["modle=cnn"])
     with pytest.raises(ConfigError, match="write KEY=VALUE"):
         select(everything, ["model"])
+
+
+@pytest.mark.parametrize(
+    ("pattern", "seeds"),
+    [("cnn-uniform-s1", {1}), ("*s1", {1}), ("cnn-uniform-s1*", {1, 10, 12}), ("cnn-uniform-s", {0, 1, 10, 12})],
+)
+def test_a_seed_in_a_runs_name_is_not_the_start_of_a_longer_one(
+    recorded: Recorded, tmp_path: Path, pattern: str, seeds: set[int]
+) -> None:
+    for seed in (0, 1, 10, 12):
+        recorded(f"seed={seed}")
+    assert {run.config["seed"] for run in gather(tmp_path, [pattern]).trainings} == seeds
+
+
+def test_trainings_that_cannot_be_compared_are_lost_with_their_configs(recorded: Recorded, tmp_path: Path) -> None:
+    recorded("seed=0")
+    unfinished = recorded("seed=1")
+    (unfinished / "result.json").unlink()
+    Journal(unfinished).status("FAILED", "out of memory")
+    gathered = gather(tmp_path)
+    assert [run.config["seed"] for run in gathered.lost] == [1]
+    assert gathered.skipped == {unfinished.name: "failed: out of memory: the command that started it continues it"}
 
 
 @pytest.mark.parametrize(

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from atlantis_exp.commands.compare import VERB
-from atlantis_exp.comparison import comparing
+from atlantis_exp.comparison.choosing import PROTOCOL, group
 from atlantis_exp.comparison.decision import Look, mean_interval
 from atlantis_exp.comparison.figures import draw
-from atlantis_exp.comparison.gather import PROTOCOL, Gathered, Training, gather, group
-from atlantis_exp.comparison.report import page, plain
+from atlantis_exp.comparison.gather import Gathered, StoredRun, Training, gather
+from atlantis_exp.comparison.page import page, plain
 from atlantis_exp.comparison.tables import Comparison, compare, to_csv
 from atlantis_exp.comparison.verdict import Group, Question, answer, families, group_of, wanted
 from atlantis_exp.comparison.words import spent
@@ -27,6 +27,7 @@ from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal
+from atlantis_exp.sessions import comparing
 from atlantis_exp.statistics import interquartile_mean
 
 Recorded = Callable[..., Path]
@@ -66,7 +67,8 @@ def of(model: str, seed: int, scores: Sequence[float], sampler: str = "uniform",
     )
     facts: dict[str, Any] = {"tags": {}, "policy": "", **changes}
     science = {key: value for key, value in config.items() if key != "budget.steps"}
-    return Training(f"{model}-{sampler}-s{seed}", config, science, {}, table, **facts)
+    tags = facts.pop("tags")
+    return Training(f"{model}-{sampler}-s{seed}", config, tags, science, {}, table, **facts)
 
 
 def around(model: str, score: float, seeds: Iterable[int] = range(5), **changes: Any) -> list[Training]:
@@ -221,7 +223,7 @@ def test_unbalanced_groups_and_seeds_are_left_out_of_a_keys_answer_and_named() -
     assert sampler.left_out == ["tiny uniform"]
     assert list(sampler.seeds["top_half"]) == [0, 1, 2, 3]
     caveats = " ".join(comparison.caveats)
-    assert "By model, some groups do not count, for not all values have their like: cnn top_half" in caveats
+    assert "By model, groups without a counterpart for every value are left out: cnn top_half" in caveats
     assert "By sampler, top_half goes without seed 4, which not all of its groups have." in caveats
 
 
@@ -243,9 +245,9 @@ def test_a_baseline_is_compared_with_each_other_one_and_the_table_gets_the_diffe
     ]
     assert "tiny plays worse than cnn by 2,000 points (1," in comparison.verdict
     header, cnn, resnet, tiny = plain("scores", comparison.tables["scores"])
-    assert header == ["group", "seeds", "score", "difference", "verdict"]
+    assert header == ["group", "seeds", "mean of IQMs", "difference", "verdict"]
     assert (cnn[3], resnet[3][:7], tiny[3][:8]) == ("", "2,000 (", "-2,000 (")
-    assert plain("scores", compared(runs).tables["scores"])[0] == ["group", "seeds", "score"]
+    assert plain("scores", compared(runs).tables["scores"])[0] == ["group", "seeds", "mean of IQMs"]
 
 
 def test_a_baseline_may_be_a_value_of_a_key_or_a_group_and_nothing_else() -> None:
@@ -329,6 +331,14 @@ def test_looks_are_taken_where_they_are_planned_and_the_same_seeds_charge_nothin
     assert widths[1] < widths[0]
 
 
+def test_where_a_look_decides_some_pairs_the_others_take_the_next_one_at_once_if_they_have_its_seeds() -> None:
+    runs = around("cnn", 1_000.0, range(10)) + around("other", 1_001.0, range(10)) + around("resnet", 9_000.0)
+    (each,) = compared(runs).answers
+    assert [look.size for look in each.decision.looks] == [5, 10]
+    assert each.taken is each.decision.looks[-1]
+    assert {verdict.said: verdict.seeds for verdict in each.decision.verdicts} == {"not decided": 10, "worse": 5}
+
+
 def test_a_look_that_nobody_planned_is_charged_and_said() -> None:
     runs = [*around("cnn", 3_000.0, range(7)), *around("resnet", 3_015.0, range(7))]
     first = compared([run for run in runs if run.config["seed"] < 5])
@@ -367,7 +377,7 @@ def test_a_difference_within_delta_is_a_verdict_too() -> None:
 
 def test_scores_that_are_no_numbers_are_left_out(recorded: Recorded, tmp_path: Path) -> None:
     folder = recorded(scores=(1_000.0, float("nan")))
-    assert "has a score that is no finite number" in gather(tmp_path).skipped[folder.name]
+    assert "it has numbers beyond 1e15" in gather(tmp_path).skipped[folder.name]
 
 
 def test_the_seeds_that_the_next_look_wants_are_named_group_by_group() -> None:
@@ -463,7 +473,7 @@ def test_runs_of_a_look_that_are_gone_or_score_otherwise_are_named() -> None:
     runs = [*around("cnn", 3_000.0, range(6)), *around("resnet", 5_000.0, range(6))]
     record = {each.family.name: each.decision.looks for each in compared(runs[:5] + runs[6:11]).answers}
     said = (
-        "By model, runs of past looks are gone or have other scores now, and what was said stays: cnn against resnet."
+        "By model, runs of past looks are gone or have other scores now, and their verdicts stay: cnn against resnet."
     )
     assert said not in compared(runs, record=record).caveats
     for others in ([of("resnet", 2, (1.0,) * 4)], []):
@@ -497,6 +507,29 @@ def test_runs_of_different_precisions_devices_or_processors_are_named() -> None:
     assert "on different processors, so that equal hours are not equal work: Fast 2: cnn-uniform-s0, " in caveats
 
 
+def test_a_run_that_does_not_say_what_made_it_may_differ_from_those_that_do() -> None:
+    runs = [*around("cnn", 3_000.0, tags={"processor": "Fast 2"}), *around("resnet", 5_000.0)]
+    assert any("equal work: Fast 2: cnn-uniform-s0, " in line for line in compared(runs).caveats)
+    assert any("; not recorded: resnet-uniform-s0, " in line for line in compared(runs).caveats)
+
+
+def test_seeds_that_a_group_has_lost_are_named_next_to_its_verdict() -> None:
+    runs = [*around("cnn", 3_000.0), *around("resnet", 5_000.0)]
+
+    def lost(model: str, seed: int) -> StoredRun:
+        there = of(model, seed, (0.0,))
+        return StoredRun(there.name, there.config, {}, RunFolder(Path(there.name)), None, [])
+
+    gathered = Gathered(runs, lost=[lost("cnn", 5), lost("cnn", 6), lost("resnet", 4), lost("tiny", 0)])
+    caveats = compare(gathered, group(runs, ["model"]), Question(["model"])).caveats
+    assert [line for line in caveats if " lacks " in line] == [
+        "cnn lacks 2 seeds, unfinished or unusable: cnn-uniform-s5, cnn-uniform-s6. If how it played is the reason, "
+        "the others do not stand for it.",
+        "tiny lacks 1 seed, unfinished or unusable: tiny-uniform-s0. If how it played is the reason, the others do "
+        "not stand for it.",
+    ]
+
+
 def test_runs_that_were_not_trained_equally_long_are_named_unless_that_is_the_question() -> None:
     runs = [*around("cnn", 3_000.0), *around("resnet", 5_000.0)]
     assert not any("equally long" in line for line in compared(runs).caveats)
@@ -517,22 +550,41 @@ def test_evaluations_of_unequal_size_are_named() -> None:
     assert any(said in line for line in compared(runs).caveats)
 
 
-def test_who_leads_while_training_is_said_as_a_description() -> None:
+def learned(**ends: float) -> list[Training]:
+    """Five seeds of each network whose training scores end around a value."""
+
     def curve(end: float) -> dict[str, Any]:
         return {"frames": np.array([0.0, 100.0]), "epsilon": np.zeros(2), "score": np.array([0.0, end])}
 
-    runs = [
+    return [
         replace(run, curve=curve(end + STEADY[run.config["seed"]]))
-        for model, end in (("cnn", 1_000.0), ("resnet", 2_000.0))
+        for model, end in ends.items()
         for run in around(model, 3_000.0)
     ]
+
+
+def test_nobody_leads_while_training_where_the_interval_includes_zero() -> None:
+    (note, *_) = compared(learned(cnn=1_010.0, resnet=1_000.0)).notes
+    assert note == (
+        "In training, no lead is clear at equal frames, where an interval includes zero: descriptions, not verdicts."
+    )
+    (note, *_) = compared(learned(cnn=9_000.0, resnet=1_000.0, tiny=8_990.0)).notes
+    assert "no lead is clear" in note
+
+
+def test_who_leads_while_training_is_said_as_a_description() -> None:
+    runs = learned(cnn=1_000.0, resnet=2_000.0)
     comparison = compared(runs)
-    assert "In training resnet leads at equal frames: a description, which nothing is decided by." in comparison.notes
+    assert "In training, resnet leads at equal frames: descriptions, not verdicts." in comparison.notes
     (view,) = comparison.tables["views"]
     assert (view["leader"], view["difference"]) == ("resnet", pytest.approx(1_000))
     assert view["low"] < 1_000 < view["high"]
     assert "decided" not in view
     few = compared(runs[:3] + runs[5:8])
+    assert (
+        few.notes[0]
+        == "In training, nothing can be said of equal frames, for want of seeds: descriptions, not verdicts."
+    )
     assert all(np.isnan(row["low"]) for row in (*few.tables["views"], *few.tables["curves"]))
     assert len({row["run"] for row in few.tables["seed_curves"]}) == 6
     assert comparison.tables["seed_curves"] == []

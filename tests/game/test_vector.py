@@ -212,6 +212,31 @@ def test_a_worker_killed_in_a_step_is_named_and_the_others_end(mortal: tuple[Pro
         emulators.receive()
 
 
+@pytest.mark.parametrize("is_asked_to_stop", [False, True])
+def test_a_worker_that_hangs_is_named_and_the_others_end(
+    mortal: tuple[ProcessEmulators, list[int]], is_asked_to_stop: bool
+) -> None:
+    emulators, (victim, _) = mortal
+    emulators.patience = 60 if is_asked_to_stop else 2
+    emulators.stop = lambda: is_asked_to_stop
+    os.kill(victim, signal.SIGSTOP)
+    began = time.monotonic()
+    with pytest.raises(WorkerDied, match=r"worker 0, environments \[0, 2\], hangs: no answer and no work for \d s"):
+        emulators.step([0] * NUM_ENVS)
+    assert time.monotonic() - began < 40
+    assert not workers_of_this_process() & {victim}
+
+
+def test_a_worker_that_works_for_longer_than_one_may_hang_is_waited_for() -> None:
+    with ProcessEmulators(functools.partial(make, max_frames=10**6), 2, workers=2) as emulators:
+        emulators.reset(range(2), [0, 1])
+        state = emulators.state_dict()
+        emulators.patience = 0.05  # seconds; playing the episode again takes several times as long
+        state["0"]["actions"] = np.zeros(12_000, np.uint8)
+        emulators.load_state_dict(state)
+        assert emulators.state_dict()["0"]["actions"].size == 12_000
+
+
 def test_an_exception_in_a_worker_is_told(mortal: tuple[ProcessEmulators, list[int]]) -> None:
     emulators, _ = mortal
     with pytest.raises(WorkerDied, match=r"worker 0, environments \[0, 2\], died of IndexError\('list index out of"):
@@ -292,7 +317,7 @@ def test_workers_import_nothing_but_this_wing_what_a_fault_is_and_what_pays_poin
     code = "import sys, atlantis_exp.game.atlantis, atlantis_exp.game.vector; print(*sys.modules)"
     modules = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True).stdout.split()
     ours = {name for name in modules if name.startswith("atlantis_exp.")}
-    assert ours == {"atlantis_exp.game", "atlantis_exp.faults", "atlantis_exp.registry"} | {
+    assert ours == {"atlantis_exp.game", "atlantis_exp.faults", "atlantis_exp.games"} | {
         f"atlantis_exp.game.{room}" for room in ("atlantis", "preprocessing", "emulator", "vector")
     }
     assert not {"torch", "mlflow", "hydra", "omegaconf", "matplotlib"} & set(modules)

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from atlantis_exp.faults import Fault
 from atlantis_exp.replay.frames import FrameStore
 from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.replay.samplers import PrioritizedSampler, Sampler, TopHalfSampler, UniformSampler
@@ -204,3 +205,11 @@ def test_a_prioritized_sampler_of_an_empty_memory_says_so() -> None:
     memory = ReplayMemory(10, (4, 4), budget_bytes=1 << 20)
     with pytest.raises(ValueError, match="no transition"):
         PrioritizedSampler(0.5, 0.5).sample(memory, 1, np.random.default_rng(0))
+
+
+def test_priorities_of_nothing_do_not_hang_the_search() -> None:
+    memory, sampler = memory_with_rewards(np.zeros(15)), PrioritizedSampler(0.5, 0.5)
+    sampler.sample(memory, 4, np.random.default_rng(0))
+    sampler.load_state_dict({**sampler.state_dict(), "priorities": np.zeros(16)})
+    with pytest.raises(Fault, match="not of this replay memory"):
+        sampler.sample(memory, 4, np.random.default_rng(0))

@@ -110,10 +110,11 @@ def test_a_table_of_many_times_the_episodes_of_any_evaluation_is_small_enough(tm
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("", "is no table of episodes"),
-        (GOLDEN.splitlines()[0], "is no table of episodes"),
+        ("", "is not a table of episodes"),
+        (GOLDEN.splitlines()[0], "is not a table of episodes"),
         ("episode,seed,score,steps,frames,truncated\n0,1,300.0,4,12,0\n", "does not say who chose the actions"),
         (GOLDEN.replace("300.0", "many"), "could not convert"),
+        *((GOLDEN.replace("300.0", huge), "numbers beyond 1e15") for huge in ("1e308", "nan", "-inf")),
     ],
 )
 def test_what_is_no_table_is_refused(tmp_path: Path, text: str, fault: str) -> None:

@@ -1,11 +1,12 @@
 import hashlib
-import inspect
 import json
 import math
 import os
 import resource
+import shutil
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -21,20 +22,19 @@ from atlantis_exp.runs.journal import (
     Artifact,
     Image,
     Journal,
+    JournalError,
     Metrics,
     Model,
-    NullJournal,
     Params,
     Record,
     Tags,
     Tracker,
     adopt,
     curve,
-    fitted,
     read,
     read_commit,
-    restore,
 )
+from atlantis_exp.runs.lock import held
 
 
 def records(folder: Path) -> list[Record]:
@@ -282,8 +282,6 @@ def test_a_journal_cut_under_its_writer_is_refused_and_not_filled_with_zeros(tmp
     journal.metrics({"score": 2}, 2)
     with pytest.raises(ValueError, match="is shorter than its writer left it"):
         journal.state_dict()
-    with pytest.raises(ValueError, match="is shorter than its writer left it"):
-        restore(tmp_path, 5, [b"as of another copy"])
     assert b"\0" not in (tmp_path / "journal.jsonl").read_bytes()
 
 
@@ -291,7 +289,7 @@ def test_a_journal_with_a_damaged_line_is_refused_before_anything_is_trained_on_
     state = journaled(tmp_path, 1, 2)
     path = tmp_path / "journal.jsonl"
     path.write_bytes(bytes(20) + path.read_bytes()[20:])
-    with pytest.raises(ValueError, match=r"byte 0: no record of a journal.*resume=never"):
+    with pytest.raises(ValueError, match=r"byte 0: not a record of a journal.*resume=never"):
         Journal(tmp_path).load_state_dict(state)
 
 
@@ -359,6 +357,47 @@ def test_a_file_that_cannot_be_written_leaves_the_one_before_it(tmp_path: Path) 
     with pytest.raises(TypeError):
         write_file(tmp_path / "a", "not bytes")  # type: ignore[arg-type]
     assert (tmp_path / "a").read_bytes() == b"before"
+
+
+@pytest.mark.parametrize("goes_on", ["run", "snapshot"])
+def test_a_run_and_its_snapshot_by_hard_links_both_go_on_without_the_other(tmp_path: Path, goes_on: str) -> None:
+    run, snapshot = tmp_path / "run", tmp_path / "snapshot"
+    with held(run, "run", 0.0):
+        journaled(run, 1)
+    shutil.copytree(run, snapshot, copy_function=os.link)
+    folder, other = (run, snapshot) if goes_on == "run" else (snapshot, run)
+    before = {path.name: path.read_bytes() for path in other.iterdir()}
+    with held(folder, "run", 0.0):
+        journal = Journal(folder)
+        assert journal.resume()
+        journal.metrics({"score": 2}, 2)
+        journal.flush()
+    assert steps(folder) == [1, 2]
+    assert {path.name: path.read_bytes() for path in other.iterdir()} == before
+    assert Journal(other).resume()
+
+
+@pytest.mark.parametrize("name", ["journal.jsonl", "commit.json", "commit.json.aside", "holder.txt", "artifacts/file"])
+def test_a_hard_link_in_a_run_folder_is_not_written_through(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "run"
+    (tmp_path / "thesis").write_text("mine")
+    (folder / "artifacts").mkdir(parents=True)
+    os.link(tmp_path / "thesis", folder / name)
+    with suppress(JournalError), held(folder, "run", 0.0):
+        journal = Journal(folder)
+        journal.artifact("file", b"theirs")
+        journal.flush()
+    assert (tmp_path / "thesis").read_text() == "mine"
+
+
+@pytest.mark.parametrize("field", ["offset", "started", "updated"])
+@pytest.mark.parametrize("number", [-5, 2**63])
+def test_a_commit_out_of_range_is_refused(tmp_path: Path, field: str, number: int) -> None:
+    journaled(tmp_path, 1)
+    commit = json.loads((tmp_path / "commit.json").read_bytes())
+    (tmp_path / "commit.json").write_text(json.dumps({**commit, field: number}))
+    with pytest.raises(JournalError, match=r"commit\.json is damaged"):
+        read_commit(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["journal.jsonl", "commit.json", "commit.json.aside", "artifacts"])
@@ -460,37 +499,13 @@ def test_an_unknown_kind_of_record_is_named(tmp_path: Path) -> None:
         list(read(tmp_path, 0, 20))
 
 
-@pytest.mark.parametrize("room", [0, 59, 60, 200, 1_099, 1_100])
-def test_a_table_in_a_note_keeps_to_its_room_and_says_what_it_leaves_out(room: int) -> None:
-    lines = [f"line {number:05}" for number in range(100)]  # 100 x 10 characters, and 99 ends
-    text = fitted(lines, room, "`x.csv`")
-    kept, _, left = text.partition("\n\n... and ")
-    shown = kept.splitlines()
-    assert shown == lines[: len(shown)]
-    assert left == ("" if room >= 1_099 else f"{100 - len(shown)} more in `x.csv`.")
-    assert len(text) <= max(room, 60)
-    assert len(shown) >= (room - 60) // 11
-
-
 def test_a_folder_without_a_journal_has_no_commit_and_no_records(tmp_path: Path) -> None:
     assert read_commit(tmp_path) is None
     assert records(tmp_path) == []
 
 
-def test_the_null_journal_has_the_journals_interface(tmp_path: Path) -> None:
-    trackers: list[Tracker] = [Journal(tmp_path), NullJournal()]
-    public = [name for name in vars(Tracker) if inspect.isfunction(getattr(Tracker, name)) and name[0] != "_"]
-    assert {"metrics", "commit", "state_dict"} <= set(public)
-    for name in public:
-        wanted = inspect.signature(getattr(Tracker, name))
-        for tracker in trackers:
-            assert inspect.signature(getattr(type(tracker), name)) == wanted, (tracker, name)
-    of_others = {"resume", "flush", "finish", "recover"}  # than a training that goes on
-    assert {name for name in vars(Journal) if name[0] != "_"} == set(public) | of_others
-
-
-def test_the_null_journal_accepts_everything_and_remembers_nothing() -> None:
-    null = NullJournal()
+def test_a_plain_tracker_accepts_everything_and_remembers_nothing() -> None:
+    null = Tracker()
     null.metrics({"?": math.inf}, -1)
     null.load_state_dict(null.state_dict())
     assert vars(null) == {}

@@ -3,6 +3,8 @@
 import dataclasses
 import hashlib
 import json
+import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from atlantis_exp.commands.evaluate import EvaluateConfig
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
+from atlantis_exp.sessions import cards
 from atlantis_exp.sessions.cards import Card, pack, portable
 
 Command = Callable[..., int]
@@ -61,6 +64,12 @@ def folder(tiny: Compose, tmp_path: Path) -> Path:
         ("evaluation.episodes", 0, "card.json: evaluation.episodes=0: should be greater than or equal to 1"),
         ("format", 2, "card.json: format=2"),
         ("scores", [], "card.json: scores=[]"),
+        ("scores", [1e308, 1e308], "card.json: scores.0=1e+308: should be less than or equal to 1000"),
+        (
+            "scores",
+            [0] * 1_000_001,
+            "...: should have at most 1000000 items",
+        ),
     ],
 )
 @pytest.mark.thinned(3)
@@ -108,8 +117,41 @@ def test_a_card_that_is_none_is_one_line(
     (folder / "card.json").write_text(content)
     assert command("evaluate", f"weights={folder}", f"paths.outputs={folder.parent}/o") == 2
     error = capsys.readouterr().err
-    assert error.startswith(f"atlantis_exp: {folder}/card.json: ")
+    assert error.startswith(f"atlantis_exp: weights={folder}: card.json: ")
     assert error.count("\n") == 1
+
+
+def test_a_pipe_in_a_card_s_place_is_one_line(
+    command: Command, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "card.json").unlink()
+    os.mkfifo(folder / "card.json")
+    assert command("evaluate", f"weights={folder}", f"paths.outputs={folder.parent}/o") == 2
+    assert f"weights={folder}: card.json: {folder}/card.json is no regular file\n" in capsys.readouterr().err
+
+
+def test_weights_that_are_not_numbers_are_not_played(
+    command: Command, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arrays = safetensors.numpy.load_file(folder / "weights.safetensors")
+    weights = safetensors.numpy.save({name: np.full_like(array, np.nan) for name, array in arrays.items()})
+    (folder / "weights.safetensors").write_bytes(weights)
+    card = json.loads((folder / "card.json").read_text())
+    (folder / "card.json").write_text(json.dumps({**card, "sha256": hashlib.sha256(weights).hexdigest()}))
+    assert command("evaluate", f"weights={folder}", f"paths.outputs={folder.parent}/o") == 1
+    assert "the weights are not all finite numbers" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("episodes", [10_000, 10_001, 1_000_000])
+def test_the_interval_of_a_card_of_many_episodes_takes_seconds(tiny: Compose, episodes: int) -> None:
+    scores = np.random.default_rng(0).normal(1_000, 100, episodes).tolist()
+    began = time.process_time()
+    mean, interval, *_ = cards._points(tiny().evaluation, scores)
+    low, high = map(float, interval.replace(",", "").split(" to "))
+    half = 1.96 * 100 / episodes**0.5
+    assert low == pytest.approx(float(mean.replace(",", "")) - half, abs=1.1)
+    assert high == pytest.approx(float(mean.replace(",", "")) + half, abs=1.1)
+    assert time.process_time() - began < 60
 
 
 def test_a_misspelt_folder_and_a_run_beside_a_folder_are_one_line(

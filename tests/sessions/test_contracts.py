@@ -4,14 +4,17 @@ import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from atlantis_exp.commands.app import Asked
+from atlantis_exp.commands.check import VERB
 from atlantis_exp.commands.overrides import check
-from atlantis_exp.components import admit
+from atlantis_exp.components import KINDS, admit
 from atlantis_exp.config import Config
 from atlantis_exp.faults import Fault
-from atlantis_exp.sessions import contracts
+from atlantis_exp.sessions.contracts import check as check_contracts
 from atlantis_exp.sessions.contracts import trials
 from atlantis_exp.sessions.job import Job, replaced
 
@@ -94,7 +97,7 @@ BREACHES = [  # what a part is replaced by, and the contracts that it breaks
         ("discount 0",),
     ),
     ('{"drawn": self.drawn}', '{"drawn": 0}', ("state there and back",)),
-    ("[:batch_size], None", ", None", ("a batch of what there is",)),
+    ("[:batch_size], None", ", None", ("a batch of available transitions",)),
     ("return 0.5", "return 1.5 - progress", ("in [0, 1]",)),
     ("return 0.5", "return 0.5 - progress", ("in [0, 1]", "finite, not negative")),
 ]
@@ -115,7 +118,7 @@ def test_a_breach_is_named(
     (tmp_path / "mine.py").write_text(PARTS.replace(part, instead, 1))
     ((_, config),) = check("config", Config, [*tiny_overrides, f"plugins={tmp_path / 'mine.py'}", *CHOSEN]).items()
     broken = set()
-    for _, contract, trial in trials(config, Job(config)):
+    for _, contract, trial in trials(config, Job(config), KINDS):
         if not contract.startswith("killed"):  # which takes processes
             try:
                 trial()
@@ -126,14 +129,36 @@ def test_a_breach_is_named(
     assert bool(broken) == bool(contracts)
 
 
-def test_what_is_broken_is_said_before_anything_is_measured(
-    tiny: Callable[..., Config], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(contracts, "trials", lambda *_: [("model=mine", "learns", partial(int, "x"))])
-    monkeypatch.setattr(contracts, "_costs", lambda _: pytest.fail("measured"))
-    job = Job(tiny())
+def test_what_is_broken_is_said_before_anything_is_measured() -> None:
+    not_measured: Any = {"model=mine": None}
     with pytest.raises(Fault, match=r"^broken: model=mine: learns$"):
-        contracts.check(job, job, [])
+        check_contracts(iter([("model=mine", "learns", partial(int, "x"))]), not_measured)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "tried", "measured"),
+    [
+        (("sampler=mine",), {"sampler=mine"}, ["sampler=mine", "sampler=uniform"]),
+        (("objective=mine",), {"objective=mine"}, ["objective=mine", "objective=dqn"]),
+        (("model=mine",), {"model=mine"}, ["model=mine", "model=cnn", "model=resnet"]),
+        (("epsilon=mine",), {"epsilon=mine"}, []),
+        (
+            ("model=mine", "lr_schedule=mine"),
+            {"model=mine", "lr_schedule=mine"},
+            ["model=mine\nlr_schedule=mine", "model=cnn", "model=resnet"],
+        ),
+    ],
+)
+def test_components_that_are_named_are_tried_and_no_others(
+    chosen: tuple[str, ...], tried: set[str], measured: list[str], tmp_path: Path, tiny_overrides: tuple[str, ...]
+) -> None:
+    (tmp_path / "mine.py").write_text(PARTS)
+    words = [text for text in tiny_overrides if text.partition("=")[0] not in KINDS]
+    ((overrides, config),) = check("config", Config, [*words, f"plugins={tmp_path / 'mine.py'}", *chosen]).items()
+    call: Any = VERB.work(Asked(config, "check", overrides))
+    trials, jobs = call.args
+    assert {part for part, *_ in trials} == {*tried, "all"}
+    assert [*jobs] == measured
 
 
 @pytest.mark.slow
@@ -146,7 +171,8 @@ def test_the_table_says_what_is_kept_and_what_it_costs(
     shown = capsys.readouterr().out
     assert "BROKEN" not in shown
     assert re.search(r"killed and continued is unbroken, bit for bit +│ kept", shown)
-    assert [re.search(rf"│ {name} +│ +40 │ +[\d,]+ │", shown) is not None for name in ("mine", "cnn", "resnet")]
+    names = ("model=mine", "model=cnn", "model=resnet", "sampler=uniform", "objective=dqn")
+    assert [re.search(rf"│ {name} +│ +40 │ +[\d,]+ │", shown) is not None for name in names] == [True] * 5
     assert not (tmp_path / "outputs").exists()
     (tmp_path / "mine.py").write_text(PARTS.replace("return 0.5", "return 7"))
     assert command("check", *replaced(words, "model=cnn")) == 1

@@ -26,7 +26,7 @@ from atlantis_exp.sessions import evaluating
 from atlantis_exp.sessions.evaluating import _held, _placeable, play, play_baseline
 from atlantis_exp.sessions.reporting import report
 from atlantis_exp.sessions.window import Window
-from atlantis_exp.tracking.store import PLACE
+from atlantis_exp.tracking.mirror import PLACE
 
 Capture = pytest.CaptureFixture[str]
 Command = Callable[..., int]
@@ -97,7 +97,7 @@ def test_a_held_button_scores_2000_and_the_run_holds_its_report_table_picture_an
     words = ("agent=constant", "env.workers=1", "evaluation.episodes=2", "evaluation.num_envs=1")
     config = composed("baseline", BaselineConfig, *words, f"paths.outputs={tmp_path}")
     name = config.run_name()
-    play_baseline(**vars(config), name=name, title=config.title(), command="python -m atlantis_exp baseline")
+    play_baseline(**vars(config), name=name, title=config.title(), command="python -m atlantis_exp baseline", cores=1)
     printed = capsys.readouterr().out
     assert "avg score: 2000.0  high score: 2000.0  low score: 2000.0" in printed
 
@@ -116,7 +116,7 @@ def test_a_held_button_scores_2000_and_the_run_holds_its_report_table_picture_an
     tables = {item.path for item in client.list_artifacts(run.info.run_id, "evaluation")}
     assert tables == {"evaluation/episodes.csv", "evaluation/report.txt"}
 
-    report(paths=config.paths)
+    report(Path(config.paths.outputs))
     table = capsys.readouterr().out
     assert run.info.run_name == f"constant 1 Atlantis-v0 {config.identity()[:6]}"
     assert name in table
@@ -152,7 +152,7 @@ def press(pygame: Any, key: int) -> None:
 
 def play_composed(outputs: Path, *overrides: str) -> None:
     short = ("player=ann", "env.max_steps=20", "evaluation.video=false", "tracking=none", f"paths.outputs={outputs}")
-    play(**vars(composed("play", PlayConfig, *short, *overrides)), command="python -m atlantis_exp play")
+    play(**vars(composed("play", PlayConfig, *short, *overrides)), command="python -m atlantis_exp play", cores=1)
 
 
 def test_a_persons_episode_is_a_run_that_a_comparison_finds(

@@ -2,6 +2,7 @@
 
 import json
 import re
+import resource
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -9,14 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import safetensors.numpy
+import safetensors.torch
+import torch
 import yaml
 
-from atlantis_exp.comparison.gather import gather, group, plays_alike
+from atlantis_exp.build import build_network
+from atlantis_exp.comparison.choosing import group, plays_alike
+from atlantis_exp.comparison.gather import gather
 from atlantis_exp.comparison.tables import compare
 from atlantis_exp.comparison.verdict import Question
 from atlantis_exp.config import Config
+from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.sessions import cards, onnx
+from atlantis_exp.sessions import cards, exporting, onnx
 from atlantis_exp.sessions.cards import build_exported_actor, read_card
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.training import train
@@ -190,6 +196,55 @@ def test_an_export_neither_overwrites_nor_starts_without_weights(
     (tmp_path / "file").touch()
     assert command("export", outputs, "weights=latest", f"to={tmp_path}/file") == 2
     assert capsys.readouterr().err == f"atlantis_exp: to={tmp_path}/file: is not empty; name another folder\n"
+
+
+def test_an_export_to_a_full_disk_is_one_line_and_leaves_nothing(
+    command: Command, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("export", f"to={tmp_path}/new", "episodes=1", f"paths.outputs={trained}", "device=cpu")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))  # bytes, fewer than the weights have
+    try:
+        assert command(*words) == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    error = capsys.readouterr().err
+    assert error.startswith(f"atlantis_exp: to={tmp_path}/new: [Errno 27] File too large")
+    assert error.count("\n") == 1
+    assert {path.name for path in tmp_path.iterdir()} == {"runs"}
+    assert command(*words) == 0
+    assert read_card(tmp_path / "new")[0].run
+
+
+@pytest.mark.parametrize(
+    ("command_of_the_run", "kept"),
+    [
+        ("python -m atlantis_exp train 'paths.outputs=/home/me/my thesis/a' model=cnn", "model=cnn"),
+        ("python -m atlantis_exp train '+tracking.uri=http://a b' seed=1 tracking=none", "seed=1 tracking=none"),
+        (
+            "python -m atlantis_exp train 'plugins=/home/me/my nets/a.py,~/b/c.py,../d.py'",
+            "plugins=./a.py,./c.py,./d.py",
+        ),
+        ("python -m atlantis_exp train 'training.weights=/home/my me/cnn@0a'", "training.weights=./cnn@0a"),
+        ("python -m atlantis_exp train '--config-dir=/home/my me/conf'", "--config-dir=./conf"),
+        ("python -m atlantis_exp train env.id=ALE/Atlantis-v5 'x=[1, 2]'", "env.id=ALE/Atlantis-v5 'x=[1, 2]'"),
+    ],
+)
+def test_an_exported_command_names_no_place_of_this_machine(command_of_the_run: str, kept: str) -> None:
+    assert exporting._without_places(command_of_the_run) == f"python -m atlantis_exp train {kept}"
+
+
+def test_why_a_network_cannot_be_onnx_is_said_whole_and_without_colours(
+    tiny: Compose, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise torch.onnx.OnnxExporterError("\x1b[96m[torch.onnx]\x1b[0m failed\n\nSize must be a multiple of 7")
+
+    monkeypatch.setattr(torch.onnx, "export", fail)
+    config = tiny()
+    weights = safetensors.torch.save(build_network(config, "network").state_dict())
+    with pytest.raises(Fault, match=r"as ONNX: \[torch\.onnx\] failed Size must be a multiple of 7$"):
+        onnx.export_onnx(config, weights)
 
 
 @pytest.mark.slow

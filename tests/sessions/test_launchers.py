@@ -11,12 +11,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 from rich.console import Console
 
-from atlantis_exp.build import build_emulators
 from atlantis_exp.commands.overrides import check, launcher
 from atlantis_exp.config import Config, PathsConfig
 from atlantis_exp.faults import ConfigError, Fault
@@ -24,8 +22,7 @@ from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal, read_commit
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.launchers import BASIC, Launcher
-from atlantis_exp.sessions.launchers.joblib import _shared_cores, train_apart
-from atlantis_exp.sessions.launchers.ray import _start
+from atlantis_exp.sessions.launchers.joblib import shared, train_side_by_side
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.training import train
 from atlantis_exp.sessions.verifying import fingerprints
@@ -100,46 +97,55 @@ def seeds(tiny: Compose, tmp_path: Path) -> Callable[..., list[Config]]:
     ]
 
 
-def test_the_launcher_of_a_command_line_is_known_and_a_missing_extra_is_one_line(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the extra joblib is not installed")
+def test_the_launcher_of_a_command_line_is_known_and_a_wrong_setting_is_one_line() -> None:
     words = ["seed=0,1", "hydra/launcher=joblib", "hydra.launcher.n_jobs=3"]
-    assert launcher("config", words) == launcher("config", ["-m", "seed=0,1"]) == BASIC
-    assert launcher("config", ["-m", *words]) == Launcher("joblib", 3)
-    with pytest.raises(ConfigError, match=r"n_jbos"):
+    assert launcher(["-m", "seed=0,1"]) == BASIC
+    assert launcher(["-m", *words]) == Launcher("joblib", {"n_jobs": 3})
+    with pytest.raises(ConfigError, match=r"^hydra.launcher.n_jobs=many: should be a number, as -1$"):
+        launcher(["-m", "seed=0,1", "hydra/launcher=joblib", "hydra.launcher.n_jobs=many"])
+    with pytest.raises(ConfigError, match=r"n_jbos=3: no such key; did you mean 'hydra.launcher.n_jobs'"):
         check("config", Config, ["-m", "seed=0,1", "hydra/launcher=joblib", "hydra.launcher.n_jbos=3"])
     with pytest.raises(ConfigError, match=r"_target_=os.system: no such key"):  # which would be run
         check("config", Config, ["-m", "seed=0,1", "hydra/launcher=joblib", "hydra.launcher._target_=os.system"])
-    monkeypatch.setitem(sys.modules, "hydra_plugins.hydra_joblib_launcher.joblib_launcher", None)
-    with pytest.raises(ConfigError, match=r"^hydra/launcher=joblib: needs pip install 'atlantis-exp\[joblib\]'$"):
-        check("config", Config, ["-m", "seed=0,1", "hydra/launcher=joblib"])
 
 
-@pytest.mark.parametrize(("n_jobs", "share"), [(1, 8), (2, 4), (3, 2), (16, 2), (-1, 2)])
-def test_jobs_share_the_cores_of_the_machine(
-    tiny: Compose, recorded: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, n_jobs: int, share: int
+@pytest.mark.parametrize(
+    ("n_jobs", "at_once", "share"), [(1, 1, 8), (2, 2, 4), (3, 3, 2), (16, 3, 2), (-1, 3, 2), (-7, 2, 4), (-99, 1, 8)]
+)
+def test_jobs_that_are_left_share_the_cores_of_the_machine(
+    tiny: Compose, recorded: Callable[..., Path], n_jobs: int, at_once: int, share: int
 ) -> None:
-    joblib = pytest.importorskip("joblib", reason="the extra joblib is not installed")
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    monkeypatch.setattr(joblib, "cpu_count", lambda: 8)
-    monkeypatch.setattr(joblib, "effective_n_jobs", lambda jobs: 8 if jobs == -1 else jobs)
     jobs = [Job(tiny(f"seed={seed}")) for seed in range(4)]
     recorded("seed=3")
-    with _shared_cores(Launcher("joblib", n_jobs), jobs):
-        assert os.environ["OMP_NUM_THREADS"] == str(share)
-    assert "OMP_NUM_THREADS" not in os.environ
+    assert shared(8, n_jobs, jobs) == (at_once, share)
 
 
-def test_emulator_workers_keep_to_their_share_and_leave_the_identity_alone(
+class FakeProcess:
+    """A process that ends at once."""
+
+    code = 0
+
+    def wait(self) -> int:
+        return self.code
+
+
+def test_jobs_side_by_side_are_told_their_share_unless_a_person_has_said_one(
     tiny: Compose, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(3)))
-    config = tiny("env.num_envs=4")
-    for share, workers in (("2", 2), ("64", 3), ("", 3)):
-        monkeypatch.setenv("OMP_NUM_THREADS", share)
-        with build_emulators(config.env, 4) as emulators:
-            assert len(emulators._processes) == workers  # type: ignore[attr-defined]
+    told: list[tuple[str, str]] = []
+
+    class Ends(FakeProcess):
+        def __init__(self, _: list[str], env: dict[str, str], **__: object) -> None:
+            told.append((env["OMP_NUM_THREADS"], env["ATLANTIS_EXP_JOB_OF"]))
+
+    monkeypatch.setattr(subprocess, "Popen", Ends)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
+    jobs = [Job(tiny(f"seed={seed}")) for seed in range(2)]
+    train_side_by_side(jobs, Launcher("joblib", {"n_jobs": 2}))
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    train_side_by_side(jobs, Launcher("joblib", {"n_jobs": 2}))
+    assert told == [("4", "joblib")] * 2 + [("3", "joblib")] * 2
 
 
 def test_the_table_follows_the_commits_of_runs(
@@ -199,13 +205,14 @@ def test_a_job_whose_process_dies_after_its_run_has_ended_is_not_marked(
 ) -> None:
     job = Job(tiny())
 
-    def ends(command: list[str], **_: object) -> "subprocess.CompletedProcess[bytes]":
-        recorded()
-        return subprocess.CompletedProcess(command, code)
+    class Dies(FakeProcess):
+        def __init__(self, *_: object, **__: object) -> None:
+            recorded()
+            self.code = code
 
-    monkeypatch.setattr(subprocess, "run", ends)
+    monkeypatch.setattr(subprocess, "Popen", Dies)
     with pytest.raises(Fault, match=RunFolder.of(job.config).name):
-        train_apart(job)
+        train_side_by_side([job], Launcher("joblib", {"n_jobs": 1}))
     assert RunFolder.of(job.config).state == "done"
 
 
@@ -213,7 +220,6 @@ def test_a_job_whose_process_dies_after_its_run_has_ended_is_not_marked(
 def test_jobs_side_by_side_fail_and_are_killed_alone_and_the_same_command_runs_what_is_missing(
     sweep: Sweep, seeds: Callable[..., list[Config]], tiny: Compose, tmp_path: Path
 ) -> None:
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the extra joblib is not installed")
     words = (*FREQUENT, "phase.quick.steps=400")
     configs = seeds(*words)
     killed, failing, whole = (RunFolder.of(config) for config in configs)
@@ -249,7 +255,6 @@ def test_jobs_side_by_side_fail_and_are_killed_alone_and_the_same_command_runs_w
 def test_jobs_that_begin_anew_find_what_was_there_put_aside(
     sweep: Sweep, seeds: Callable[..., list[Config]], tmp_path: Path
 ) -> None:
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the extra joblib is not installed")
     words = (*FREQUENT, "phase.quick.steps=60")
     command = (*words, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1,2", "resume=never")
     for _ in range(2):
@@ -265,7 +270,6 @@ def test_jobs_that_begin_anew_find_what_was_there_put_aside(
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["interrupted", "terminated", "killed"])
 def test_the_end_of_a_sweep_commits_its_jobs(sweep: Sweep, seeds: Callable[..., list[Config]], how: str) -> None:
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the extra joblib is not installed")
     configs = seeds(*LONG)
     folders = [RunFolder.of(config) for config in configs]
     process = sweep(*LONG, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1,2")
@@ -280,51 +284,3 @@ def test_the_end_of_a_sweep_commits_its_jobs(sweep: Sweep, seeds: Callable[..., 
     assert [folder.status for folder in folders[:2]] == ["KILLED", "KILLED"]
     if how != "killed":
         assert statuses(configs[0]) == ["KILLED"] * 3
-
-
-def test_without_an_address_ray_starts_a_cluster_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where it would join one that another sweep has started on this machine."""
-    ray = pytest.importorskip("ray", reason="the extra ray is not installed")
-    for name in ("RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"):
-        monkeypatch.setenv(name, "0")
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    asked: list[object] = []
-    monkeypatch.setattr(ray, "init", lambda **settings: asked.append(settings["address"]))
-    _start({"address": None})
-    _start({"address": "127.0.0.1:6379"})
-    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:6380")
-    _start({"address": None})
-    assert asked == ["local", "127.0.0.1:6379", None]
-
-
-@pytest.mark.slow
-def test_on_a_ray_cluster_of_two_nodes_a_killed_workers_job_is_continued(
-    sweep: Sweep, seeds: Callable[..., list[Config]], tiny: Compose, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("hydra_plugins.hydra_ray_launcher", reason="the extra ray is not installed")
-    for name in ("RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"):
-        monkeypatch.setenv(name, "0")
-    monkeypatch.setenv("RAY_AUTH_TOKEN", "a" * 64)
-    from ray.cluster_utils import Cluster
-
-    node: dict[str, Any] = {"num_cpus": 1, "object_store_memory": 78_643_200}
-    cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
-    try:
-        cluster.add_node(**node)
-        words = (*FREQUENT, "phase.quick.steps=400", "resume=never")  # which is meant once
-        configs = seeds(*words)
-        process = sweep(
-            *words, "hydra/launcher=ray", f"hydra.launcher.ray.init.address={cluster.address}", "seed=0,1,2"
-        )
-        killed = RunFolder.of(configs[0])
-        wait_for(lambda: trains(killed))
-        os.kill(holder(killed), signal.SIGKILL)
-        assert process.wait(timeout=250) == 0, (tmp_path / "printed.txt").read_text()
-    finally:
-        cluster.shutdown()
-    assert "continuing run" in (killed.path / "output.txt").read_text()
-    assert statuses(configs[0]) == ["FINISHED"] * 4
-    paths = PathsConfig(outputs=str(tmp_path / "u"))
-    unbroken = dataclasses.replace(tiny(*words, "tracking=none"), paths=paths)
-    train(Job(unbroken))
-    assert fingerprints(configs[0], tmp_path / "o") == fingerprints(unbroken, tmp_path / "u")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import shlex
 import signal
 import sqlite3
@@ -16,8 +17,10 @@ from typing import Any
 import pytest
 
 from atlantis_exp.commands.app import Asked
+from atlantis_exp.commands.decide import VERB as DECIDE
+from atlantis_exp.commands.decide import DecideConfig, contest_of
 from atlantis_exp.commands.overrides import check
-from atlantis_exp.commands.search import SearchConfig, request_of
+from atlantis_exp.commands.search import SearchConfig, search_of
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Metrics, Tags, read, read_commit
@@ -28,7 +31,7 @@ from atlantis_exp.training.trainer import Trainer
 
 pytest.importorskip("optuna", reason="needs pip install 'atlantis-exp[search]'")
 
-from atlantis_exp.sessions.search import Request, _open, _Session, search
+from atlantis_exp.sessions.search import Search, Trials, search
 
 REPOSITORY = Path(__file__).parents[2]
 SHORT = ("phase.quick.steps=80", "env.max_steps=20", "evaluation.every_steps=null", "evaluation.episodes=1")
@@ -36,19 +39,19 @@ SPACE = ("optimizer=adam,rmsprop", "optimizer.lr=tag(log, interval(1e-5, 1e-3))"
 
 
 @pytest.fixture
-def searching(tmp_path: Path, tiny_overrides: tuple[str, ...]) -> "Callable[..., Request]":
+def searching(tmp_path: Path, tiny_overrides: tuple[str, ...]) -> "Callable[..., Search]":
     """A search as a command line asks for it: `searching("trials=3", space=SPACE)`."""
 
-    def asked(*overrides: str, space: tuple[str, ...] = SPACE) -> Request:
+    def asked(*overrides: str, space: tuple[str, ...] = SPACE) -> Search:
         short = replaced(tiny_overrides, *SHORT, f"paths.outputs={tmp_path}")
         fixed = tuple(replaced(short, *overrides))
         ((texts, config),) = check("search", SearchConfig, fixed).items()
-        return request_of(Asked(config, "search", texts, typed=(*fixed, *space)))
+        return search_of(Asked(config, "search", texts, typed=(*fixed, *space)))
 
     return asked
 
 
-Searching = Callable[..., Request]
+Searching = Callable[..., Search]
 
 
 def rows(outputs: Path, query: str, *values: Any) -> list[tuple[Any, ...]]:
@@ -56,13 +59,12 @@ def rows(outputs: Path, query: str, *values: Any) -> list[tuple[Any, ...]]:
         return database.execute(query, values).fetchall()
 
 
-def session_of(searching: Searching, *overrides: str, space: tuple[str, ...] = SPACE[1:]) -> _Session:
-    return _open(searching(*overrides, space=space))
+def trials_of(searching: Searching, *overrides: str, space: tuple[str, ...] = SPACE[1:]) -> Trials:
+    return Trials(searching(*overrides, space=space))
 
 
-def job_of(session: _Session, number: int) -> Job:
-    values = [f"{key}={value}" for key, value in session.trials[number].params.items()]
-    return session.request.job_of([*session.request.overrides, *values])
+def job_of(trials: Trials, number: int) -> Job:
+    return trials.job(trials.all[number], 0)
 
 
 def test_a_search_trains_its_trials_under_a_run_of_its_own_and_goes_on_where_more_are_asked_for(
@@ -78,53 +80,50 @@ def test_a_search_trains_its_trials_under_a_run_of_its_own_and_goes_on_where_mor
     assert first.stat().st_mtime_ns == trained
     assert len(list(tmp_path.glob("runs/*/result.json"))) == 2
     assert "trial 1: optimizer=" in printed
-    assert f"the best in full: python -m atlantis_exp {request.overrides[0]}" in printed
+    assert f"The best in full: python -m atlantis_exp {request.overrides[0]}" in printed
 
-    session = _open(request)
-    best, other = session.ranking
-    result = RunFolder(tmp_path / "runs" / best.user_attrs["run"]).result
+    trials = Trials(request)
+    (best, scores), (other, _) = trials.ranking
+    result = RunFolder(tmp_path / "runs" / best.user_attrs["runs"][0]).result
     assert result is not None
-    assert best.value == result.evaluation["evaluation/mean"] >= (other.value or 0.0)
-    points = [record for _, record in read(session.folder.path) if isinstance(record, Metrics)]
+    assert scores == [best.value] == [result.evaluation["evaluation/mean"]]
+    assert scores[0] >= (other.value or 0.0)
+    points = [record for _, record in read(trials.folder.path) if isinstance(record, Metrics)]
     assert [point.step for point in points] == [0, 1]
     assert points[-1].values["search/best"] == best.value
-    artifacts = session.folder.path / "artifacts"
-    assert {path.name for path in artifacts.iterdir()} == {"history.png", "importance.png", "parallel_coordinates.png"}
-    assert all(path.read_bytes().startswith(b"\x89PNG") for path in artifacts.iterdir())
 
-    runs = [RunFolder(tmp_path / "runs" / trial.user_attrs["run"]) for trial in (best, other)]
-    assert {run.parent.resolve() for run in runs if run.parent} == {session.folder.path}
+    runs = [RunFolder(tmp_path / "runs" / trial.user_attrs["runs"][0]) for trial in (best, other)]
+    assert {run.parent.resolve() for run in runs if run.parent} == {trials.folder.path}
     tags = [record.values for _, record in read(runs[0].path) if isinstance(record, Tags)]
     (command,) = [values["command"] for values in tags if "command" in values]
     assert command.endswith(f"optimizer={best.params['optimizer']} optimizer.lr={best.params['optimizer.lr']}")
-    page = read_commit(session.folder.path)
+    page = read_commit(trials.folder.path)
     assert page is not None
     assert page.status == "FINISHED"
 
 
 def test_a_signal_that_comes_when_a_trial_has_nothing_left_to_stop_ends_the_search_after_it(
-    searching: Searching, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    searching: Searching, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def trained(job: Job, watch: Callable[[Trainer], bool]) -> int:
         assert train(job, watch) is None
         return signal.SIGTERM
 
-    monkeypatch.setattr("atlantis_exp.sessions.search.train", trained)
     request = searching("trials=2", space=SPACE[1:])
     with pytest.raises(SystemExit, match="143"):
-        search(request)
+        search(request, trained)
     assert capsys.readouterr().err.endswith(f"SIGTERM: the search goes on with: {request.command}\n")
-    assert [trial.state.name for trial in _open(request).trials] == ["COMPLETE"]
+    assert [trial.state.name for trial in Trials(request).all] == ["COMPLETE"]
 
 
 def test_a_trial_that_nobody_holds_goes_on_before_a_new_one_is_drawn(searching: Searching) -> None:
-    session = session_of(searching, "trials=3")
-    with session.claimed() as left:
+    trials = trials_of(searching, "trials=3")
+    with trials.claimed() as left:
         pass
-    with open(session.folder.path / "trials.jsonl", "ab") as file:
+    with open(trials.folder.path / "trials.jsonl", "ab") as file:
         file.write(b'{"op_code":4,"work')  # a line that the process was killed in
-    other = _open(session.request)
-    with other.claimed() as trial, session.claimed() as new:
+    other = Trials(trials.asked)
+    with other.claimed() as trial, trials.claimed() as new:
         assert left is not None
         assert trial is not None
         assert new is not None
@@ -144,21 +143,21 @@ def test_a_trial_that_nobody_holds_goes_on_before_a_new_one_is_drawn(searching: 
     ids=lambda line: line[:20].decode(errors="replace"),
 )
 def test_a_damaged_record_of_the_trials_is_one_line_and_loses_no_other_line(searching: Searching, line: bytes) -> None:
-    session = session_of(searching, "trials=3")
-    with session.claimed():
+    trials = trials_of(searching, "trials=3")
+    with trials.claimed():
         pass
-    file = session.folder.path / "trials.jsonl"
+    file = trials.folder.path / "trials.jsonl"
     content = file.read_bytes()
     file.write_bytes(content + line + b"\n")
     with pytest.raises(Fault, match=f"{file} is damaged") as fault:
-        _open(session.request)
+        Trials(trials.asked)
     assert "\n" not in str(fault.value)
     assert file.read_bytes().startswith(content)
 
 
 def test_a_record_of_the_trials_that_is_a_link_or_a_pipe_is_one_line(searching: Searching, tmp_path: Path) -> None:
-    session = session_of(searching, "trials=3")
-    file = session.folder.path / "trials.jsonl"
+    trials = trials_of(searching, "trials=3")
+    file = trials.folder.path / "trials.jsonl"
     (tmp_path / "mine").write_text("mine")
     for is_link in (True, False):
         file.unlink()
@@ -167,15 +166,15 @@ def test_a_record_of_the_trials_that_is_a_link_or_a_pipe_is_one_line(searching: 
         else:
             os.mkfifo(file)
         with pytest.raises(Fault, match="is no regular file"):
-            _open(session.request)
+            Trials(trials.asked)
     assert (tmp_path / "mine").read_text() == "mine"
 
 
 def test_what_is_drawn_depends_on_the_number_of_the_trial_and_those_before_alone(searching: Searching) -> None:
     request, drawn = searching(space=SPACE[1:]), []
     for name in ("a", "b"):
-        session = _open(dataclasses.replace(request, name=name))
-        with session.claimed() as first, session.claimed() as second:
+        trials = Trials(dataclasses.replace(request, name=name))
+        with trials.claimed() as first, trials.claimed() as second:
             assert first is not None
             assert second is not None
             drawn.append((first.params, second.params))
@@ -183,31 +182,89 @@ def test_what_is_drawn_depends_on_the_number_of_the_trial_and_those_before_alone
     assert drawn[0][0] != drawn[0][1]
 
 
-def test_values_that_are_under_way_are_not_trained_twice(searching: Searching) -> None:
-    session = session_of(searching, "trials=2", space=("optimizer=choice(adam)",))
-    with session.claimed(), session.claimed() as again:
-        assert again is not None
-        session.train(again, StopRequest())
-    assert session.trials[1].state.name == "FAIL"
-    assert "trial 0, which is under way, has the same values" in session.trials[1].user_attrs["error"]
+Played = Callable[[Job, Callable[[Trainer], bool]], None]
+
+
+@pytest.fixture
+def played(recorded: Callable[..., Path]) -> Played:
+    """Writes the result of a training in the place of training it: its mean is the seed's last digit."""
+
+    def play(job: Job, _: Callable[[Trainer], bool]) -> None:
+        score = float(job.config.seed % 10)
+        recorded(*job.overrides, scores=(score,))
+
+    return play
+
+
+def test_a_trial_is_as_good_as_the_mean_of_its_seeds(
+    searching: Searching, played: Played, capsys: pytest.CaptureFixture[str]
+) -> None:
+    search(searching("trials=1", "seeds=3", space=("optimizer=choice(rmsprop)",)), played)
+    shown = capsys.readouterr().out
+    assert re.search(r"│ +0 │ +1 │ -1 to 3 │ rmsprop +│ cnn-uniform-s1000-", shown)  # of 0, 1 and 2; t of 2 is 4.30
+    assert "One training each" not in shown
+
+
+def test_values_that_are_drawn_again_are_trained_with_other_seeds(
+    searching: Searching, played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    search(searching("trials=3", space=("optimizer=choice(rmsprop)",)), played)
+    assert sorted(path.name.split("-")[2] for path in tmp_path.glob("runs/*")) == ["s1000", "s1001", "s1002"]
+    shown = capsys.readouterr().out
+    assert re.search(r"│ +0 │ +1 │ -1 to 3 │ rmsprop", shown)
+    assert "partly luck" not in shown  # there is nothing it was chosen from
+
+
+def test_the_best_is_called_lucky_and_tested_against_the_default_with_other_seeds(
+    searching: Searching, recorded: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def better_than_the_default(job: Job, _: Callable[[Trainer], bool]) -> None:
+        recorded(*job.overrides, scores=(1 / job.config.optimizer.lr,), steps=100, outcome="budget")
+
+    request = searching("trials=2", "seed=1_007", "budget.wall_clock=1h", "budget.steps=100")
+    search(request, better_than_the_default)
+    shown = capsys.readouterr().out
+    assert "The best of 2 is partly luck: its own mean is optimistic.\n" in shown
+    assert "One training each: other seeds may rank the values differently" in shown
+    values = [f"{key}={value}" for key, value in Trials(request).ranking[0][0].params.items()]
+    (line,) = (line for line in shown.splitlines() if line.startswith("Better than the default? "))
+    typed = shlex.split(line)[7:]
+    assert shlex.split(line)[4:7] == ["python", "-m", "atlantis_exp"]
+    assert typed[0] == "decide"
+    assert typed[-1] == f"against={','.join(values)}"
+    assert "budget.steps=100" in typed
+    assert not any(text.startswith(("seed=", "budget.wall_clock=")) for text in typed)
+    ((texts, config),) = check("decide", DecideConfig, DECIDE.rewrite(typed[1:])).items()
+    contest = contest_of(Asked(config, "decide", texts, typed=tuple(typed[1:])))
+    (_, default), (_, best) = contest.contenders.values()
+    assert default.config.optimizer.name == "adamw"
+    assert best.config.science() == {
+        **Trials(request).job(Trials(request).ranking[0][0], 0).config.science(),
+        "seed": 0,
+    }
+
+
+def test_the_default_is_not_tested_against_itself(
+    searching: Searching, played: Played, capsys: pytest.CaptureFixture[str]
+) -> None:
+    search(searching("trials=1", space=("optimizer=choice(adamw)",)), played)
+    assert "Better than the default?" not in capsys.readouterr().out
 
 
 @pytest.mark.slow
 def test_a_trial_below_the_median_is_committed_and_can_be_trained_to_its_end(searching: Searching) -> None:
-    session = session_of(
-        searching, "trials=2", "evaluation.every_steps=40", "pruning.trials=1", "pruning.evaluations=0"
-    )
-    with session.claimed() as good:
+    trials = trials_of(searching, "trials=2", "evaluation.every_steps=40", "pruning.trials=1", "pruning.evaluations=0")
+    with trials.claimed() as good:
         assert good is not None
         good.report(1e6, 1)
-        session.study.tell(good.number, 1e6)
-    with session.claimed() as trial:
+        trials.study.tell(good.number, 1e6)
+    with trials.claimed() as trial:
         assert trial is not None
-        session.train(trial, StopRequest())
-    pruned = session.trials[1]
+        trials.train(trial, StopRequest())
+    pruned = trials.all[1]
     assert pruned.state.name == "PRUNED"
     assert list(pruned.intermediate_values) == [1]
-    job = job_of(session, 1)
+    job = job_of(trials, 1)
     folder = RunFolder.of(job.config)
     assert folder.state == "interrupted"
     tags = {
@@ -216,10 +273,10 @@ def test_a_trial_below_the_median_is_committed_and_can_be_trained_to_its_end(sea
         if isinstance(record, Tags)
         for key, value in record.values.items()
     }
-    assert tags["pruned"] == f"trial 1 of {session.folder.name}, at step 40"
+    assert tags["pruned"] == f"trial 1 of {trials.folder.name}, at step 40"
     train(job)
     assert folder.result is not None
-    assert [number for number, value in enumerate(session.trials) if value.state.name == "COMPLETE"] == [0]
+    assert [number for number, value in enumerate(trials.all) if value.state.name == "COMPLETE"] == [0]
 
 
 @pytest.mark.slow
@@ -228,37 +285,32 @@ def test_a_trial_that_fails_is_recorded_and_the_search_goes_on(
 ) -> None:
     request = searching("trials=3", space=("optimizer.lr=1e-4,1e30",))  # the larger one diverges
     search(request)
-    session = _open(request)
-    states = {(trial.params["optimizer.lr"], trial.state.name) for trial in session.trials}
+    trials = Trials(request)
+    states = {(trial.params["optimizer.lr"], trial.state.name) for trial in trials.all}
     assert states == {("0.0001", "COMPLETE"), ("1e+30", "FAIL")}
     assert "no finite number" in capsys.readouterr().out
 
 
 def test_a_search_without_a_trial_that_was_trained_to_its_end_says_so(searching: Searching) -> None:
     with pytest.raises(Fault, match="no trial was trained to its end; 0 of 20 trials"):
-        session_of(searching).print_results()
+        trials_of(searching).print_results()
 
 
 @pytest.mark.slow
 def test_a_run_that_went_on_beyond_the_budget_is_no_result_of_a_search_within_it(searching: Searching) -> None:
-    session = session_of(searching, "budget.steps=40", space=("optimizer=choice(adam)",))
-    with session.claimed() as trial:
+    trials = trials_of(searching, "budget.steps=40", space=("optimizer=choice(adam)",))
+    with trials.claimed() as trial:
         assert trial is not None
-        config = job_of(session, 0).config
+        config = job_of(trials, 0).config
         train(Job(dataclasses.replace(config, budget=dataclasses.replace(config.budget, steps=None))))
-        session.train(trial, StopRequest())
-    assert "was trained for 80 steps already" in session.trials[0].user_attrs["error"]
-    with session.claimed() as trial:
-        assert trial is not None
-        session.study.tell(trial.number, 1.0)
-    assert "budget.steps" not in session.best_command()
-    assert session.best_command().endswith("optimizer=adam")
+        trials.train(trial, StopRequest())
+    assert "was trained for 80 steps already" in trials.all[0].user_attrs["error"]
 
 
 def test_a_name_is_one_searchs(searching: Searching) -> None:
-    session_of(searching, "name=mine", space=("optimizer=choice(adam)",))
+    trials_of(searching, "name=mine", space=("optimizer=choice(adam)",))
     with pytest.raises(ConfigError, match="name=mine: was begun for another space or another training"):
-        session_of(searching, "name=mine", "env.size=48", space=("optimizer=choice(adam)",))
+        trials_of(searching, "name=mine", "env.size=48", space=("optimizer=choice(adam)",))
 
 
 @pytest.mark.slow
@@ -270,17 +322,17 @@ def test_at_the_end_of_its_time_a_search_leaves_its_trial_to_be_continued(search
         ) as caught:
             search(request)
         assert caught.value.exit_code == 124
-        session = _open(request)
-        if session.trials:
+        trials = Trials(request)
+        if trials.all:
             break
-    assert [trial.state.name for trial in session.trials] == ["RUNNING"]
-    assert RunFolder(tmp_path / "runs" / session.trials[0].user_attrs["run"]).state == "interrupted"
-    commit = read_commit(session.folder.path)
+    assert [trial.state.name for trial in trials.all] == ["RUNNING"]
+    assert RunFolder(tmp_path / "runs" / trials.all[0].user_attrs["runs"][0]).state == "interrupted"
+    commit = read_commit(trials.folder.path)
     assert commit is not None
     assert commit.status == "KILLED"
 
 
-def started(request: Request) -> "subprocess.Popen[str]":
+def started(request: Search) -> "subprocess.Popen[str]":
     """A process of the command that a search says it goes on with."""
     return subprocess.Popen(
         (sys.executable, *shlex.split(request.command)[1:]),
@@ -304,12 +356,12 @@ LONG = ("phase.quick.steps=1_500", "tracking.commit_seconds=0.2", "trials=2")
 
 @pytest.mark.slow
 def test_a_search_that_is_interrupted_and_killed_is_the_unbroken_one(searching: Searching, tmp_path: Path) -> None:
-    def results(session: _Session) -> list[Any]:
-        return [(trial.number, trial.state, trial.params, trial.value) for trial in session.trials]
+    def results(trials: Trials) -> list[Any]:
+        return [(trial.number, trial.state, trial.params, trial.value) for trial in trials.all]
 
     request = searching(*LONG, f"paths.outputs={tmp_path}/unbroken")
     search(request)
-    unbroken = _open(request)
+    unbroken = Trials(request)
 
     request = searching(*LONG, f"paths.outputs={tmp_path}/broken")
     for number in (signal.SIGINT, signal.SIGKILL):
@@ -327,7 +379,7 @@ def test_a_search_that_is_interrupted_and_killed_is_the_unbroken_one(searching: 
     out, errors = process.communicate()
     assert process.returncode == 0, errors
     assert "continuing run" in out
-    assert results(_open(request)) == results(unbroken)
+    assert results(Trials(request)) == results(unbroken)
     assert len(list(tmp_path.glob("broken/runs/*"))) == 2
 
 
@@ -337,10 +389,10 @@ def test_several_processes_share_a_search_and_end_together(searching: Searching,
     processes = [started(request), started(request)]
     outputs = [process.communicate() for process in processes]
     assert [process.returncode for process in processes] == [0, 0], outputs
-    assert all("the best in full" in out for out, _ in outputs)
-    session = _open(request)
-    assert [trial.state.name for trial in session.trials] == ["COMPLETE"] * 4
-    assert len({trial.user_attrs["run"] for trial in session.trials}) == len(list(tmp_path.glob("runs/*"))) == 4
+    assert all("The best in full" in out for out, _ in outputs)
+    trials = Trials(request)
+    assert [trial.state.name for trial in trials.all] == ["COMPLETE"] * 4
+    assert len({trial.user_attrs["runs"][0] for trial in trials.all}) == len(list(tmp_path.glob("runs/*"))) == 4
     trained = ["starting run" in out for out, _ in outputs]
     assert trained == [True, True]
     stored = dict(rows(tmp_path, "SELECT name, run_uuid FROM runs"))

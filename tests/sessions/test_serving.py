@@ -3,7 +3,6 @@
 The browser is the system's chromium or the one that playwright has installed; without either the tests are skipped.
 """
 
-import os
 import re
 import shutil
 import signal
@@ -13,6 +12,8 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -24,12 +25,19 @@ from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.sweep import ledger
 from atlantis_exp.sessions.training import train
-from atlantis_exp.tracking.store import Store, publish
+from atlantis_exp.tracking import views
+from atlantis_exp.tracking.mirror import publish
+from atlantis_exp.tracking.store import Store
 
 REPOSITORY = Path(__file__).parents[2]
-pytestmark = pytest.mark.slow
 COMMAND = (sys.executable, "-m", "atlantis_exp", "ui")
 SECONDS = 60_000  # that a page may take, in ms
+
+
+def a_finished_run(folder: Path) -> None:
+    journal = Journal(folder)
+    journal.metrics({"evaluation/mean": 1.0}, 1)
+    journal.finish()
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +77,7 @@ def outputs(page: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noq
 
 @pytest.fixture(scope="module")
 def address(outputs: Path, free_port: Callable[[], int], answering: Callable[..., None]) -> Iterator[str]:
-    """What the command prints, once the server answers."""
+    """The address that the command prints, once the server answers."""
     port = free_port()
     server = subprocess.Popen(
         (*COMMAND, f"port={port}", f"paths.outputs={outputs}"),
@@ -77,26 +85,57 @@ def address(outputs: Path, free_port: Callable[[], int], answering: Callable[...
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
-        start_new_session=True,  # it has a process that serves
     )
     assert server.stdout is not None
     shown = next(line for line in server.stdout if line.startswith("MLflow UI: ")).split()[-1]
     answering(server, port)
     yield shown
-    os.killpg(server.pid, signal.SIGKILL)
-    server.wait()
+    server.send_signal(signal.SIGINT)
+    assert server.wait() == 0
 
 
+def test_the_runs_that_the_store_lacks_are_published_and_the_plain_address_leads_to_them(
+    tmp_path: Path, free_port: Callable[[], int], answering: Callable[..., None]
+) -> None:
+    a_finished_run(tmp_path / "runs" / "first")
+    publish(tmp_path / "runs" / "first", Store(tmp_path))
+    a_finished_run(tmp_path / "runs" / "copied from elsewhere")
+    port = free_port()
+    server = subprocess.Popen(
+        (*COMMAND, f"port={port}", f"paths.outputs={tmp_path}"), cwd=REPOSITORY, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        answering(server, port)
+        with urlopen(f"http://127.0.0.1:{port}/") as page:
+            assert 'location.replace("/#/experiments/1/runs?' in page.read().decode()
+        with pytest.raises(HTTPError, match="403"):  # MLflow's guard against other sites
+            urlopen(Request(f"http://127.0.0.1:{port}/", headers={"Host": "elsewhere.org"}))
+    finally:
+        server.send_signal(signal.SIGINT)
+    shown, _ = server.communicate(timeout=60)
+    assert server.returncode == 0
+    assert "  published   runs/copied from elsewhere\n" in shown
+    assert "runs/first" not in shown
+    assert f"MLflow UI: http://127.0.0.1:{port}\n" in shown
+    assert {run.info.run_name for run in Store(tmp_path).runs()} == {"first", "copied from elsewhere"}
+
+
+@pytest.mark.slow
 def test_the_server_listens_on_this_machine_alone(address: str) -> None:
-    port = int(re.findall(r":(\d+)/", address)[0])
+    port = int(address.rpartition(":")[2])
     tables = [Path("/proc/net", name).read_text().splitlines()[1:] for name in ("tcp", "tcp6")]
     listening = [line.split()[1] for table in tables for line in table if line.split()[3] == "0A"]
     assert [place for place in listening if place.endswith(f":{port:04X}")] == [f"0100007F:{port:04X}"]
 
 
+def runs_page(address: str, place: str) -> str:
+    return f"{address}/#/experiments/1/runs{place}"
+
+
 SCRIPT = "<script>attacked=1</script><img src=x onerror=attacked=1>`<svg/onload=attacked=1> [a](javascript:attacked=1)"
 
 
+@pytest.mark.slow
 def test_no_text_of_a_run_runs_a_script_in_mlflows_pages(page: Any, address: str, outputs: Path) -> None:
     folder = outputs / "runs" / SCRIPT.replace("/", "-")
     journal = Journal(folder, {"mlflow.runName": SCRIPT, "group": SCRIPT, "atlantis.kind": "training"})
@@ -106,9 +145,8 @@ def test_no_text_of_a_run_runs_a_script_in_mlflows_pages(page: Any, address: str
     journal.flush()
     journal.status("FAILED", SCRIPT)
     publish(folder, Store(outputs))
-    (run,) = [run.run_id for run in Store(outputs).runs() if run.name == SCRIPT]
-    runs = address.partition("?")[0]
-    for place in (address, f"{runs}/{run}"):
+    (run,) = [run.info.run_id for run in Store(outputs).runs() if run.info.run_name == SCRIPT]
+    for place in (address, runs_page(address, f"/{run}")):
         page.goto("about:blank")
         page.goto(place)
         page.get_by_text("attacked=1").first.wait_for(state="attached")
@@ -121,7 +159,7 @@ def test_no_text_of_a_run_runs_a_script_in_mlflows_pages(page: Any, address: str
 def run_id(outputs: Path) -> Callable[[str], str]:
     """The id of the run whose name starts so."""
     runs = Store(outputs).runs()
-    return lambda start: min(run.run_id for run in runs if run.name.startswith(start))
+    return lambda start: min(run.info.run_id for run in runs if run.info.run_name.startswith(start))
 
 
 def size_of(image: Any) -> list[int]:
@@ -130,6 +168,7 @@ def size_of(image: Any) -> list[int]:
     return size
 
 
+@pytest.mark.slow
 def test_the_address_opens_on_charts_of_every_run_and_pictures_with_a_slider(page: Any, address: str) -> None:
     page.goto(address)
     page.get_by_text("cnn uniform s0 quick").first.wait_for()
@@ -151,28 +190,30 @@ def test_the_address_opens_on_charts_of_every_run_and_pictures_with_a_slider(pag
     )
 
 
+@pytest.mark.slow
 def test_the_first_chart_shows_the_score_of_every_run(page: Any, address: str, outputs: Path) -> None:
     page.goto("about:blank")  # else only the part behind '#' changes, and the application begins with the old view
     page.goto(address)
     chart = page.locator(".js-plotly-plot:has(.barlayer)").first
     chart.locator(".bartext").first.wait_for()
     store = Store(outputs)
-    metrics = [store.client.get_run(run.run_id).data.metrics for run in store.runs()]
+    metrics = [run.data.metrics for run in store.runs()]
     scores = [each["evaluation/interquartile_mean"] for each in metrics if "evaluation/interquartile_mean" in each]
     assert sorted(chart.locator(".bartext").all_text_contents()) == sorted(f"{score:.2f}" for score in scores)
 
 
+@pytest.mark.slow
 def test_the_sweep_view_has_a_curve_a_group(page: Any, address: str) -> None:
     page.goto("about:blank")  # else only the part behind '#' changes, and the application begins with the old view
-    page.goto(address.replace("=start", "=sweep"))
+    page.goto(views.address(address, "1", views.SWEEP))
     page.get_by_text("Group: cnn uniform quick").first.wait_for()
     page.locator(".js-plotly-plot .scatterlayer .trace").first.wait_for()
     assert page.get_by_text("cnn uniform quick").count() > 1  # the legends' as well
 
 
+@pytest.mark.slow
 def test_the_film_plays_inside_its_run(page: Any, address: str, run_id: Callable[[str], str]) -> None:
-    runs = address.partition("?")[0]
-    page.goto(f"{runs}/{run_id('cnn')}/artifacts/best_episode.mp4")
+    page.goto(runs_page(address, f"/{run_id('cnn')}/artifacts/best_episode.mp4"))
     film = page.locator("video")
     film.wait_for()
     page.wait_for_function("document.querySelector('video').readyState >= 2")
@@ -181,28 +222,29 @@ def test_the_film_plays_inside_its_run(page: Any, address: str, run_id: Callable
     page.wait_for_function("document.querySelector('video').currentTime > 0")
 
 
+@pytest.mark.slow
 def test_the_pages_of_a_run_and_of_a_sweep_begin_with_their_results(
     page: Any, address: str, run_id: Callable[[str], str]
 ) -> None:
-    runs = address.partition("?")[0]
-    page.goto(f"{runs}/{run_id('cnn')}")
+    page.goto(runs_page(address, f"/{run_id('cnn')}"))
     page.get_by_text("The best mean so far is").wait_for()
-    page.goto(f"{runs}/{run_id('sweep')}")
+    page.goto(runs_page(address, f"/{run_id('sweep')}"))
     page.get_by_text("mean of the means").first.wait_for()
-    page.goto(f"{runs}/{run_id('sweep')}/model-metrics")
+    page.goto(runs_page(address, f"/{run_id('sweep')}/model-metrics"))
     figure = page.locator("img[src*='sweep~curves']").first
     figure.wait_for()
     assert size_of(figure)[0] > 100
 
 
+@pytest.mark.slow
 def test_a_store_that_is_none_is_one_line(tmp_path: Path, free_port: Callable[[], int]) -> None:
     (tmp_path / "mlflow.db").write_bytes(b"no database" * 1_000)
     command = (*COMMAND, f"port={free_port()}", f"paths.outputs={tmp_path}")
     ended = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
     assert ended.stderr == (
-        f"atlantis_exp: sqlite:///{tmp_path}/mlflow.db cannot be opened: DatabaseError: file is not a database; "
-        "without that file sync makes it again\n"
+        f"atlantis_exp: {tmp_path}/mlflow.db cannot be used (DatabaseError: file is not a database): move it away, and "
+        f"python -m atlantis_exp sync paths.outputs={tmp_path} makes it again\n"
     )
 
 

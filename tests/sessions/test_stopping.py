@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,9 +33,8 @@ def test_a_second_interrupt_ends_the_process_at_once() -> None:
 
 
 @pytest.fixture
-def under_slurm(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
-    """A job of Slurm's; the signals that reach the handler which requeues it."""
-    monkeypatch.setenv("SLURM_JOB_ID", "7")
+def under_slurm() -> Iterator[list[int]]:
+    """The signals that reach the handler by which Slurm's launcher requeues a job."""
     tape: list[int] = []
     before = signal.signal(signal.SIGUSR2, lambda number, _: tape.append(number))
     yield tape
@@ -44,7 +44,7 @@ def under_slurm(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
 def test_under_slurm_sigterm_is_a_warning_and_sigusr2_goes_on_to_the_handler_before(
     under_slurm: list[int],
 ) -> None:
-    stop = StopRequest()
+    stop = StopRequest(under_slurm=True)
     with stop.installed():
         signal.raise_signal(signal.SIGTERM)
         assert stop()
@@ -62,7 +62,7 @@ def test_under_slurm_sigterm_is_a_warning_and_sigusr2_goes_on_to_the_handler_bef
 def test_under_slurm_the_sigterm_of_time_that_is_up_does_not_undo_the_sigusr2_before_it(
     under_slurm: list[int],
 ) -> None:
-    stop = StopRequest()
+    stop = StopRequest(under_slurm=True)
     with stop.installed():
         signal.raise_signal(signal.SIGUSR2)
         signal.raise_signal(signal.SIGTERM)  # the commit took long
@@ -86,19 +86,24 @@ def test_the_end_of_the_time_or_of_the_sweep_is_a_fault_so_that_other_jobs_go_on
     assert not StopRequest(60, lambda: True)()
 
 
+def test_the_time_begins_with_the_first_step_so_that_a_long_set_up_does_not_end_a_session_before_it() -> None:
+    stop = StopRequest(0.05)
+    with stop.installed():
+        time.sleep(0.1)  # the set-up
+        assert not stop()
+        time.sleep(0.1)
+        assert stop()
+
+
 def test_a_job_goes_on_while_the_process_that_launched_it_wants_it(tmp_path: Path) -> None:
     run, sweep = RunFolder(tmp_path / "runs" / "run"), RunFolder(tmp_path / "sweeps" / "sweep")
     assert sweep_goes_on(run, "joblib")()  # of no sweep
-    journal = Journal(sweep.path)
+    Journal(sweep.path)
     adopt(run.path, sweep.path)
 
     def wanted() -> dict[str | None, bool]:
-        return {launcher: sweep_goes_on(run, launcher)() for launcher in ("joblib", "apart", "ray", "slurm", None)}
+        return {launcher: sweep_goes_on(run, launcher)() for launcher in ("joblib", "slurm", None)}
 
-    journal.status("RUNNING")
     with sweep.held():
-        assert wanted() == {"joblib": True, "apart": True, "ray": True, "slurm": True, None: True}
-        journal.status("KILLED")
-        assert wanted() == {"joblib": False, "apart": False, "ray": False, "slurm": True, None: True}
-    journal.status("RUNNING")  # of a process that was killed before it could say so
-    assert wanted() == {"joblib": False, "apart": False, "ray": True, "slurm": True, None: True}
+        assert wanted() == {"joblib": True, "slurm": True, None: True}
+    assert wanted() == {"joblib": False, "slurm": True, None: True}

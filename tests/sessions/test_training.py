@@ -21,6 +21,7 @@ from atlantis_exp.commands.overrides import read_override
 from atlantis_exp.commands.train import VERB
 from atlantis_exp.config import Config, PathsConfig
 from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.machine import Machine
 from atlantis_exp.runs.facts import read_facts
 from atlantis_exp.runs.folder import RunFolder, find_run
 from atlantis_exp.runs.journal import Artifact, Image, Journal, Metrics, Model, adopt, read
@@ -29,8 +30,9 @@ from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.reporting import report
 from atlantis_exp.sessions.training import train
 from atlantis_exp.sessions.verifying import Session, fingerprints, run_and_kill, start, train_and_kill
+from atlantis_exp.tracking.mirror import publish
 from atlantis_exp.tracking.publishing import catch_up
-from atlantis_exp.tracking.store import Store, publish
+from atlantis_exp.tracking.store import Store
 from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints
 from atlantis_exp.training.forecast import Forecast
 from atlantis_exp.training.plan import Counters
@@ -150,7 +152,7 @@ def test_scores_of_an_evaluation_before_the_last_step_are_said_to_be(
     config = tiny("evaluation.at_end=false", "evaluation.every_steps=70")
     train(Job(config))
     assert "\nevaluated last at step 140 of 160 (evaluation.at_end=false):\n" in capsys.readouterr().out
-    report(paths=config.paths)
+    report(Path(config.paths.outputs))
     assert "160 (evaluated at 140)" in capsys.readouterr().out
 
 
@@ -266,11 +268,10 @@ def test_a_config_that_was_lost_is_written_again(tiny: Compose) -> None:
     assert RunFolder.of(config).state == "done"
 
 
-def test_slurms_next_try_of_a_run_goes_on_whatever_resume_says(tiny: Compose, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slurms_next_try_of_a_run_goes_on_whatever_resume_says(tiny: Compose) -> None:
     config = tiny(*SHORT, "resume=never")
     train(Job(config))
-    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
-    train(Job(config))
+    train(Job(config, machine=Machine(cores=1, slurm_restarts=1)))
     assert [path.name for path in RunFolder.of(config).path.parent.iterdir()] == [config.run_name()]
 
 
@@ -508,7 +509,9 @@ def test_a_commit_that_the_disk_refuses_is_one_clear_line_and_costs_nothing_comm
 
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", full)
-        with pytest.raises(Fault, match="No space left on device; continue with: "):
+        with pytest.raises(
+            Fault, match=r"paths\.outputs: .*No space left on device; make room there.*; continue with: "
+        ):
             train(Job(config))
     folder = RunFolder.of(config)
     assert folder.state == "interrupted"

@@ -1,705 +1,30 @@
-import io
-import json
 import re
 import signal
 import sqlite3
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
-import PIL.Image
 import pytest
+from mlflow.exceptions import MlflowException
 
-from atlantis_exp.runs.folder import TRACEBACK
-from atlantis_exp.runs.journal import Journal, Metrics, adopt, read, read_commit
-from atlantis_exp.tracking import store as store_module
-from atlantis_exp.tracking.publishing import catch_up
-from atlantis_exp.tracking.store import Cursor, Publisher, Store, publish, unfinished
+from atlantis_exp.faults import Fault
+from atlantis_exp.runs.journal import Journal
+from atlantis_exp.sessions.syncing import publish_all
+from atlantis_exp.tracking.mirror import publish
+from atlantis_exp.tracking.publishing import Publisher
+from atlantis_exp.tracking.store import Store
+from tests.tracking.folders import a_full_journal, commit, rows
 
 REPOSITORY = Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="session")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("store")
-
-
-@pytest.fixture(scope="session")
-def store(root: Path) -> Store:
-    return Store(root)
-
-
-def rows(root: Path, query: str, *values: Any) -> list[tuple[Any, ...]]:
-    with closing(sqlite3.connect(root / "mlflow.db")) as database:
-        return database.execute(query, values).fetchall()
-
-
-def run_id(folder: Path) -> str:
-    return str(json.loads((folder / "published.json").read_bytes())["run_id"])
-
-
-def points(root: Path, folder: Path) -> list[tuple[Any, ...]]:
-    return rows(
-        root,
-        "SELECT key, step, timestamp, value FROM metrics WHERE run_uuid = ? ORDER BY step, key, timestamp",
-        run_id(folder),
-    )
-
-
-def journaled_points(folder: Path) -> list[tuple[Any, ...]]:
-    return sorted(
-        (
-            (key, record.step, record.time, value)
-            for _, record in read(folder)
-            if isinstance(record, Metrics)
-            for key, value in record.values.items()
-        ),
-        key=lambda point: (point[1], point[0], point[2]),
-    )
-
-
-def png(grey: int = 0) -> bytes:
-    content = io.BytesIO()
-    PIL.Image.new("L", (8, 4), grey).save(content, "PNG")
-    return content.getvalue()
-
-
-def commit(journal: Journal) -> dict[str, Any]:
-    state = journal.state_dict()
-    journal.commit()
-    return state
-
-
-def a_full_journal(folder: Path) -> Journal:
-    journal = Journal(folder)
-    journal.params({f"param_{i}": str(i) for i in range(150)})
-    journal.tags({"mlflow.note.content": "# note"})
-    for step in range(100):
-        journal.metrics({f"train/metric_{i}": step + i / 8 for i in range(12)}, step)
-    for step in (50, 100):
-        journal.metrics({"evaluation/iqm": step}, step)
-        journal.image("evaluation/q", png(step), step)
-        journal.model("best", bytes(step), step, {"evaluation/iqm": step})
-    journal.artifact("report/index.html", b"<p>")
-    journal.artifact("top.txt", b"top")
-    commit(journal)
-    return journal
-
-
-def everything(root: Path, folder: Path) -> dict[str, Any]:
-    """All that MLflow shows of a folder, straight from its tables and files."""
-    run = run_id(folder)
-    [(status, location, name)] = rows(root, "SELECT status, artifact_uri, name FROM runs WHERE run_uuid = ?", run)
-    models = rows(
-        root, "SELECT model_id, name, status, artifact_location FROM logged_models WHERE source_run_id = ?", run
-    )
-    artifacts = Path(location.removeprefix("file://"))
-    return {
-        "status": status,
-        "name": name,
-        "metrics": points(root, folder),
-        "params": rows(root, "SELECT key, value FROM params WHERE run_uuid = ? ORDER BY key", run),
-        "tags": rows(root, "SELECT key, value FROM tags WHERE run_uuid = ? ORDER BY key", run),
-        "files": {
-            str(file.relative_to(artifacts)): file.read_bytes() for file in artifacts.rglob("*") if file.is_file()
-        },
-        "models": [
-            (*model[:3], [file.read_bytes() for file in Path(model[3].removeprefix("file://")).iterdir()])
-            for model in models
-        ],
-        "model metrics": rows(
-            root,
-            "SELECT metric_name, metric_step, metric_value FROM logged_model_metrics WHERE run_id = ? ORDER BY 2, 1",
-            run,
-        ),
-        "outputs": rows(root, "SELECT destination_id, step FROM inputs WHERE source_id = ? ORDER BY step", run),
-    }
 
 
 def test_importing_the_store_does_not_import_mlflow() -> None:
     check = "import atlantis_exp.tracking.store, sys; assert 'mlflow' not in sys.modules"
     subprocess.run([sys.executable, "-c", check], cwd=REPOSITORY, check=True)
-
-
-def test_mlflow_shows_what_is_committed_and_no_more(tmp_path: Path, root: Path, store: Store) -> None:
-    journal = Journal(tmp_path)
-    journal.metrics({"score": 1}, 1)
-    commit(journal)
-    journal.metrics({"score": 2}, 2)
-    journal.state_dict()
-    publish(tmp_path, store)
-    assert [point[1] for point in points(root, tmp_path)] == [1]
-    journal.commit()
-    publish(tmp_path, store)
-    assert [point[1] for point in points(root, tmp_path)] == [1, 2]
-
-
-def test_a_folder_is_mirrored_whole(tmp_path: Path, root: Path, store: Store) -> None:
-    folder = tmp_path / "a run"
-    a_full_journal(folder).status("FINISHED")
-    publish(folder, store)
-    shown = everything(root, folder)
-    assert (shown["status"], shown["name"]) == ("FINISHED", "a run")
-    assert shown["metrics"] == journaled_points(folder)
-    assert len(shown["params"]) == 150
-    assert ("mlflow.note.content", "# note") in shown["tags"]
-    assert ("mlflow.loggedImages", "True") in shown["tags"]
-    assert {path: shown["files"][path] for path in ("report/index.html", "top.txt")} == {
-        "report/index.html": b"<p>",
-        "top.txt": b"top",
-    }
-    assert len(shown["files"]) == 2 + 2 * 2  # an image is a full and a small file
-    assert sorted(model[1:] for model in shown["models"]) == [
-        (f"{shown['name']} {step}", 2, [bytes(step)])
-        for step in (100, 50)  # as text
-    ]
-    assert [step for _, step in shown["outputs"]] == [50, 100]
-    assert {model for model, _ in shown["outputs"]} == {model[0] for model in shown["models"]}
-    assert len(shown["model metrics"]) == 2
-
-
-@pytest.mark.parametrize("known", [True, False])
-def test_publishing_everything_again_changes_nothing(
-    tmp_path: Path, root: Path, store: Store, known: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    a_full_journal(tmp_path).status("FINISHED")
-    publish(tmp_path, store)
-    shown, cursor = everything(root, tmp_path), (tmp_path / "published.json").read_bytes()
-    (tmp_path / "published.json").unlink()
-    if not known:  # MLflow itself refuses the second copy of a point; passing over it only saves time
-        monkeypatch.setattr(store_module._Mirror, "unsent", store_module._Mirror._points)
-    publish(tmp_path, store)
-    assert everything(root, tmp_path) == shown
-    assert (tmp_path / "published.json").read_bytes() == cursor
-    identity = json.loads(cursor)["identity"]
-    assert len(rows(root, "SELECT * FROM tags WHERE value = ?", identity)) == 1
-
-
-def same_but_for_ids(shown: dict[str, Any]) -> dict[str, Any]:
-    return {
-        **{table: shown[table] for table in ("status", "name", "metrics", "params", "model metrics")},
-        "tags": [tag for tag in shown["tags"] if not tag[0].startswith("atlantis.")],
-        "files": {re.sub(r"[0-9a-f-]{36}", "ID", path): content for path, content in shown["files"].items()},
-        "models": sorted(model[1:] for model in shown["models"]),
-        "outputs": [step for _, step in shown["outputs"]],
-    }
-
-
-@pytest.mark.slow
-def test_a_process_killed_between_sending_and_noting_it_doubles_nothing(
-    tmp_path: Path, root: Path, store: Store
-) -> None:
-    a_full_journal(tmp_path)
-    publish(tmp_path, store_of_its_own := Store(root, "unbroken"))
-    unbroken = everything(root, tmp_path)
-    assert store_of_its_own.address != store.address
-    killed = f"""
-import os, signal
-from pathlib import Path
-from atlantis_exp.tracking import store
-save, calls = store.Cursor.save, []
-def save_or_die(cursor, folder):
-    calls.append(cursor)
-    if len(calls) == 5:
-        os.kill(os.getpid(), signal.SIGKILL)
-    save(cursor, folder)
-store.Cursor.save = save_or_die
-store.publish(Path({str(tmp_path)!r}), store.Store(Path({str(root)!r})))
-"""
-    process = subprocess.run([sys.executable, "-c", killed], cwd=REPOSITORY, check=False)
-    assert process.returncode == -signal.SIGKILL
-    sent = points(root, tmp_path)
-    noted = json.loads((tmp_path / "published.json").read_bytes())["offset"]
-    assert len(sent) > sum(
-        len(record.values) for end, record in read(tmp_path, 0, noted) if isinstance(record, Metrics)
-    )
-    publish(tmp_path, store)
-    assert same_but_for_ids(everything(root, tmp_path)) == same_but_for_ids(unbroken)
-
-
-def test_a_publication_that_fails_after_each_of_its_calls_doubles_nothing(
-    tmp_path: Path, root: Path, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    a_full_journal(tmp_path).status("FINISHED")
-    publish(tmp_path, Store(root, "unbroken"))
-    unbroken = everything(root, tmp_path)
-    done: set[str] = set()
-
-    def failing_once(name: str, call: Callable[..., Any]) -> Callable[..., Any]:
-        def wrapper(*arguments: Any, **options: Any) -> Any:
-            result = call(*arguments, **options)
-            key = re.sub(r"'/[^']*/|0x\w+", "", f"{name} {arguments} {options}")  # without temporary places
-            if key not in done:
-                done.add(key)
-                raise ConnectionError(key)
-            return result
-
-        return wrapper
-
-    calls = (
-        *("create_run", "log_batch", "set_tag", "log_artifact", "log_image", "set_terminated"),
-        *("create_logged_model", "log_model_artifact", "finalize_logged_model", "log_outputs"),
-    )
-    for name in calls:
-        monkeypatch.setattr(store.client, name, failing_once(name, getattr(store.client, name)))
-    for _ in range(100):
-        try:
-            publish(tmp_path, store)
-            break
-        except ConnectionError:
-            continue
-    assert {key.split()[0] for key in done} == set(calls)
-    assert same_but_for_ids(everything(root, tmp_path)) == same_but_for_ids(unbroken)
-
-
-def test_points_of_one_millisecond_survive_a_break_between_their_batches(
-    tmp_path: Path, root: Path, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as frozen:
-        frozen.setattr(time, "time_ns", lambda: 1_700_000_000_000_000_000)
-        journal = Journal(tmp_path)
-        for step in range(200):
-            journal.metrics({f"metric_{i}": step for i in range(5)}, step)
-        commit(journal)
-    saves: list[int] = []
-
-    def save_once(cursor: Any, folder: Path) -> None:
-        saves.append(cursor.offset)
-        if len(saves) == 3:
-            raise OSError("no space")
-        save(cursor, folder)
-
-    save = store_module.Cursor.save
-    monkeypatch.setattr(store_module.Cursor, "save", save_once)
-    with pytest.raises(OSError, match="no space"):
-        publish(tmp_path, store)
-    assert 0 < len(points(root, tmp_path)) < 1_000
-    publish(tmp_path, store)
-    assert points(root, tmp_path) == journaled_points(tmp_path)
-
-
-def test_a_resumed_run_shows_the_steps_it_redid_once(tmp_path: Path, root: Path, store: Store) -> None:
-    journal = Journal(tmp_path)
-    for step in range(5):
-        journal.metrics({"score": step}, step)
-    state = commit(journal)
-    journal.metrics({"score": 99}, 5)
-    journal.state_dict()  # killed before its checkpoint
-    publish(tmp_path, store)
-    resumed = Journal(tmp_path)
-    resumed.load_state_dict(state)
-    for step in range(5, 8):
-        resumed.metrics({"score": step}, step)
-    commit(resumed)
-    publish(tmp_path, store)
-    assert [(step, value) for _, step, _, value in points(root, tmp_path)] == [(step, step) for step in range(8)]
-
-
-def test_a_run_that_goes_back_behind_what_was_published_replaces_it(
-    tmp_path: Path, root: Path, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    journal = a_full_journal(tmp_path)
-    older = journal.state_dict()
-    journal.metrics({"score": 99}, 200)
-    journal.model("best", b"later", 200, {})
-    commit(journal)
-    publish(tmp_path, store)
-    replaced = run_id(tmp_path)
-    again = Journal(tmp_path)
-    again.load_state_dict(older)
-    again.metrics({"score": 1}, 200)
-    commit(again)
-    with monkeypatch.context() as broken:
-        broken.setattr(store, "open_run", lambda *_: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            publish(tmp_path, store)
-    publish(tmp_path, store)
-    assert run_id(tmp_path) != replaced
-    assert points(root, tmp_path) == journaled_points(tmp_path)
-    assert rows(root, "SELECT lifecycle_stage FROM runs WHERE run_uuid = ?", replaced) == [("deleted",)]
-    listed = (
-        "SELECT source_run_id, count(*) FROM logged_models WHERE lifecycle_stage = 'active' AND source_run_id IN (?, ?)"
-    )
-    assert rows(root, listed + " GROUP BY source_run_id", replaced, run_id(tmp_path)) == [(run_id(tmp_path), 2)]
-
-
-def test_a_note_that_was_made_up_costs_no_other_run_its_place_in_the_store(
-    tmp_path: Path, root: Path, store: Store
-) -> None:
-    theirs, ours = tmp_path / "theirs", tmp_path / "ours"
-    a_full_journal(theirs)
-    publish(theirs, store)
-    before = everything(root, theirs)
-    journal = Journal(ours)
-    journal.metrics({"score": 1}, 1)
-    commit(journal)
-    identity = read_commit(ours).identity  # type: ignore[union-attr]
-    note = json.loads((theirs / "published.json").read_text())
-    for made_up in ({"identity": "another"}, {}, {"identity": identity}):  # to be deleted, twice, and to be written to
-        (ours / "published.json").write_text(json.dumps({**note, **made_up, "offset": 0, "files": ""}))
-        publish(ours, store)
-        assert everything(root, theirs) == before
-        assert points(root, ours) == journaled_points(ours)
-        assert run_id(ours) != run_id(theirs)
-
-
-def test_a_name_is_cut_to_what_a_database_takes(tmp_path: Path, root: Path, store: Store) -> None:
-    journal = Journal(tmp_path, {"mlflow.runName": "s" * 300})
-    for score in (1, 2):
-        journal.metrics({"score": score}, score)
-        commit(journal)
-        publish(tmp_path, store)
-        told = everything(root, tmp_path)
-        assert told["name"] == "s" * 250
-        assert ("mlflow.runName", "s" * 250) in told["tags"]
-
-
-def test_a_folder_published_to_another_store_starts_anew_there_and_stays_here(
-    tmp_path: Path, root: Path, store: Store
-) -> None:
-    a_full_journal(tmp_path)
-    publish(tmp_path, store)
-    here = run_id(tmp_path)
-    publish(tmp_path, Store(root, "another"))
-    assert points(root, tmp_path) == journaled_points(tmp_path)
-    assert rows(root, "SELECT lifecycle_stage FROM runs WHERE run_uuid = ?", here) == [("active",)]
-    assert run_id(tmp_path) != here
-
-
-def test_a_publisher_follows_the_run_until_it_is_drained(
-    tmp_path: Path, root: Path, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    published = threading.Event()
-
-    def announced(folder: Path, store: Store) -> None:
-        publish(folder, store)
-        published.set()
-
-    monkeypatch.setattr(store_module, "publish", announced)
-    journal = a_full_journal(tmp_path)
-    publisher = Publisher(tmp_path, store)
-    assert published.wait(120)
-    journal.metrics({"score": 1}, 200)
-    commit(journal)
-    assert publisher.drain(120)
-    assert points(root, tmp_path) == journaled_points(tmp_path)
-
-
-def test_a_publisher_takes_others_along_whatever_becomes_of_one_and_leaves_those_that_have_yet_to_start(
-    tmp_path: Path, root: Path, store: Store
-) -> None:
-    folders = [tmp_path / name for name in ("sweep", "damaged", "waiting", "whole")]
-    for folder in (folders[0], folders[1], folders[3]):
-        a_full_journal(folder)
-    whole = (folders[1] / "journal.jsonl").read_bytes()
-    (folders[1] / "journal.jsonl").write_bytes(whole[:-10])
-    adopt(folders[2], folders[0])
-    publisher = Publisher(folders[0], store, others=folders[1:])
-    patience = time.monotonic() + 240
-    while unfinished(folders[3], root) is not None or not (folders[3] / "published.json").exists():
-        assert time.monotonic() < patience
-        time.sleep(0.05)
-    assert publisher.drain(60)  # no waiting would mend the damaged one
-    for folder in (folders[0], folders[3]):
-        assert points(root, folder) == journaled_points(folder)
-    assert not (folders[2] / "published.json").exists()
-    (folders[1] / "journal.jsonl").write_bytes(whole)
-    publish(folders[1], store)
-    assert points(root, folders[1]) == journaled_points(folders[1])
-
-
-def test_a_traceback_beside_a_failure_is_shown_with_it(tmp_path: Path, root: Path, store: Store) -> None:
-    journal = a_full_journal(tmp_path)
-    (tmp_path / TRACEBACK).write_text("Traceback\nError")
-    publish(tmp_path, store)
-    assert not list((root / "artifacts").rglob(f"{run_id(tmp_path)}/artifacts/{TRACEBACK}"))
-    journal.status("FAILED", "Error")
-    publish(tmp_path, store)
-    (shown,) = (root / "artifacts").rglob(f"{run_id(tmp_path)}/artifacts/{TRACEBACK}")
-    assert shown.read_text() == "Traceback\nError"
-
-
-def test_two_publishers_of_one_folder_make_one_run(tmp_path: Path, root: Path, store: Store) -> None:
-    a_full_journal(tmp_path)
-    publishers = [Publisher(tmp_path, store) for _ in range(2)]
-    assert all(publisher.drain(120) for publisher in publishers)
-    identity = json.loads((tmp_path / "commit.json").read_bytes())["identity"]
-    assert len(rows(root, "SELECT * FROM tags WHERE value = ?", identity)) == 1
-    assert points(root, tmp_path) == journaled_points(tmp_path)
-
-
-def test_images_are_named_and_sized_as_mlflow_itself_does(tmp_path: Path, store: Store) -> None:
-    journal = Journal(tmp_path)
-    journal.image("evaluation/q values", png(7), 3)
-    commit(journal)
-    publish(tmp_path, store)
-    run = store.client.create_run(store.experiment_id)
-    with PIL.Image.open(io.BytesIO(png(7))) as image:
-        [(_, record)] = read(tmp_path)
-        store.client.log_image(run.info.run_id, image, key=record.key, step=3, timestamp=record.time)  # type: ignore[union-attr]
-
-    def images(run_id: str) -> dict[str, Any]:
-        folder = Path(store.client.get_run(run_id).info.artifact_uri.removeprefix("file://")) / "images"
-        return {re.sub(r"[0-9a-f-]{36}", "ID", file.name): PIL.Image.open(file).size for file in folder.iterdir()}
-
-    assert images(run_id(tmp_path)) == images(run.info.run_id)
-    assert len(images(run.info.run_id)) == 2
-
-
-@pytest.mark.parametrize(
-    ("kind", "width", "end", "fault"),
-    [
-        ("EPS", 8, None, "is no PNG"),  # which PIL has Ghostscript draw
-        ("PNG", 4_097, None, "4,097 x 4 pixels"),
-        ("PNG", 8, 45, "is no PNG"),
-        ("PNG", 8, 0, "is no PNG"),
-    ],
-)
-def test_an_image_that_is_no_picture_of_ours_is_a_damaged_folders(
-    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, kind: str, width: int, end: int | None, fault: str
-) -> None:
-    content = io.BytesIO()
-    PIL.Image.new("L", (width, 4)).save(content, kind)
-    journal = Journal(tmp_path)
-    journal.image("score/heatmap", content.getvalue()[:end], 0)
-    commit(journal)
-    monkeypatch.setattr(subprocess, "check_call", lambda *_, **__: pytest.fail("runs a program"))
-    with pytest.raises(ValueError, match=fault):
-        publish(tmp_path, store)
-
-
-def test_infinite_values_stay_in_the_journal_and_nan_is_shown(tmp_path: Path, root: Path, store: Store) -> None:
-    journal = Journal(tmp_path)
-    journal.metrics({"up": float("inf"), "down": float("-inf"), "nan": float("nan"), "one": 1.0}, 1)
-    commit(journal)
-    publish(tmp_path, store)
-    shown = rows(root, "SELECT key, is_nan FROM metrics WHERE run_uuid = ? ORDER BY key", run_id(tmp_path))
-    assert shown == [("nan", 1), ("one", 0)]
-
-
-def test_a_param_that_changes_becomes_a_tag(tmp_path: Path, root: Path, store: Store) -> None:
-    journal = Journal(tmp_path)
-    journal.params({"episodes": "10", "long": "x" * 7_000})
-    journal.params({"episodes": "20", "long": "x" * 7_000})
-    commit(journal)
-    publish(tmp_path, store)
-    shown = everything(root, tmp_path)
-    assert shown["params"] == [("episodes", "10"), ("long", "x" * 6_000)]
-    assert ("episodes", "20") in shown["tags"]
-    assert "long" not in dict(shown["tags"])
-
-
-def test_the_status_follows_the_run_through_its_sessions(tmp_path: Path, root: Path, store: Store) -> None:
-    journal = Journal(tmp_path)
-    journal.metrics({"score": 1}, 1)
-    commit(journal)
-    for status in ("RUNNING", "KILLED", "RUNNING", "FAILED", "RUNNING", "FINISHED"):
-        journal.status(status)
-        publish(tmp_path, store)
-        [(shown, end)] = rows(root, "SELECT status, end_time FROM runs WHERE run_uuid = ?", run_id(tmp_path))
-        updated = json.loads((tmp_path / "commit.json").read_bytes())["updated"]
-        assert shown == status
-        assert status == "RUNNING" or end == updated
-    assert points(root, tmp_path) == journaled_points(tmp_path)
-
-
-def test_a_run_has_its_labels_and_the_error_it_failed_with_as_long_as_it_stands(tmp_path: Path, store: Store) -> None:
-    Journal(tmp_path, {"mlflow.runName": "cnn s0", "mlflow.runColor": "#0072b2"}).status("FAILED", "no such device")
-    publish(tmp_path, store)
-    failed = store.client.get_run(run_id(tmp_path))
-    assert (failed.info.run_name, failed.info.status) == ("cnn s0", "FAILED")
-    assert failed.data.tags["error"] == "no such device"
-    assert failed.data.tags["mlflow.runColor"] == "#0072b2"
-    Journal(tmp_path, {"mlflow.runName": "cnn s0 again"}).status("FINISHED")
-    publish(tmp_path, store)
-    finished = store.client.get_run(run_id(tmp_path))
-    assert (finished.info.run_id, finished.info.run_name) == (failed.info.run_id, "cnn s0 again")
-    assert "error" not in finished.data.tags
-
-
-def test_a_child_finds_its_parent_whichever_is_published_first_and_moves_to_another(
-    tmp_path: Path, root: Path, store: Store
-) -> None:
-    child, first, second = (tmp_path / name for name in ("runs/child", "sweeps/first", "sweeps/second"))
-    for parent in (first, second):
-        Journal(parent).status("RUNNING")
-    adopt(child, first)
-    Journal(child).status("FINISHED")
-    publish(child, store)
-    publish(first, store)
-    parent_of = "SELECT value FROM tags WHERE key = 'mlflow.parentRunId' AND run_uuid = ?"
-    assert rows(root, parent_of, run_id(child)) == [(run_id(first),)]
-    ended = rows(root, "SELECT end_time FROM runs WHERE run_uuid = ?", run_id(child))
-    adopt(child, second)
-    assert unfinished(child, root) is not None
-    publish(child, store)
-    assert rows(root, parent_of, run_id(child)) == [(run_id(second),)]
-    assert rows(root, "SELECT end_time FROM runs WHERE run_uuid = ?", run_id(child)) == ended
-    assert len(rows(root, "SELECT 1 FROM runs WHERE name = 'first'")) == 1
-
-
-def test_the_best_model_alone_is_marked_however_often_it_is_sent(tmp_path: Path, store: Store) -> None:
-    journal = Journal(tmp_path)
-    for step, best in ((1, True), (2, True), (3, False)):
-        journal.metrics({"score": float(step)}, step)
-        journal.model("network", b"weights", step, {"score": float(step)}, best=best)
-        commit(journal)
-        publish(tmp_path, store)
-    for _ in range(2):
-        same = f"source_run_id = '{run_id(tmp_path)}'"
-        models = store.client.search_logged_models([store.experiment_id], same)
-        assert {model.tags["step"]: model.tags.get("best") for model in models} == {"1": None, "2": "true", "3": None}
-        (tmp_path / "published.json").unlink()
-        publish(tmp_path, store)
-
-
-def test_a_file_that_is_gone_does_not_hold_up_the_rest(
-    tmp_path: Path, root: Path, store: Store, caplog: pytest.LogCaptureFixture
-) -> None:
-    journal = Journal(tmp_path)
-    journal.artifact("video.mp4", b"")
-    journal.metrics({"score": 1}, 1)
-    commit(journal)
-    (tmp_path / "artifacts/video.mp4").unlink()
-    publish(tmp_path, store)
-    assert len(points(root, tmp_path)) == 1
-    assert "video.mp4 is gone" in caplog.text
-
-
-def test_a_folder_that_never_committed_is_left_alone(tmp_path: Path, store: Store) -> None:
-    publish(tmp_path, store)
-    assert not (tmp_path / "published.json").exists()
-
-
-def test_a_folder_remembers_the_store_that_lacks_a_part_of_it(tmp_path: Path, store: Store) -> None:
-    away = Store(tmp_path, "sweep", "http://127.0.0.1:9")
-    journal = a_full_journal(tmp_path)
-    assert unfinished(tmp_path, tmp_path) is None
-    with pytest.raises(Exception, match="refused"):
-        publish(tmp_path, away)
-    lacking = unfinished(tmp_path, tmp_path)
-    assert lacking is not None
-    assert lacking.address == away.address
-    publish(tmp_path, store)
-    assert unfinished(tmp_path, tmp_path) is None
-    journal.status("FINISHED")
-    lacking = unfinished(tmp_path, store._root)
-    assert lacking is not None
-    assert lacking.address == store.address
-
-
-def test_a_run_that_somebody_deleted_in_mlflow_is_made_again_once_it_goes_on(
-    tmp_path: Path, root: Path, store: Store
-) -> None:
-    journal = a_full_journal(tmp_path)
-    publish(tmp_path, store)
-    whole, gone = points(root, tmp_path), run_id(tmp_path)
-    store.client.delete_run(gone)
-    publish(tmp_path, store)
-    assert run_id(tmp_path) == gone  # there is nothing new to send
-    journal.status("FINISHED")
-    publish(tmp_path, store)
-    assert run_id(tmp_path) != gone
-    assert points(root, tmp_path) == whole
-    (tmp_path / "published.json").write_text(
-        (tmp_path / "published.json").read_text().replace(run_id(tmp_path), "a" * 32)
-    )
-    journal.status("KILLED")
-    publish(tmp_path, store)
-    assert points(root, tmp_path) == whole
-
-
-def test_a_folder_that_is_a_link_is_not_published(tmp_path: Path, store: Store) -> None:
-    a_full_journal(tmp_path / "elsewhere")
-    (tmp_path / "run").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(ValueError, match="run is a link"):
-        publish(tmp_path / "run", store)
-    assert not (tmp_path / "elsewhere" / "published.json").exists()
-
-
-def test_a_parent_that_is_a_link_is_not_published_and_none(tmp_path: Path, store: Store) -> None:
-    run, sweep = tmp_path / "runs/run", tmp_path / "sweeps/sweep"
-    a_full_journal(tmp_path / "elsewhere")
-    sweep.parent.mkdir()
-    sweep.symlink_to(tmp_path / "elsewhere")
-    adopt(run, sweep)
-    Journal(run).status("FINISHED")
-    publish(run, store)
-    assert not (tmp_path / "elsewhere" / "published.json").exists()
-    assert "mlflow.parentRunId" not in store.client.get_run(run_id(run)).data.tags
-
-
-@pytest.mark.parametrize("parents", ["aa", "abba", "abbccb"])
-@pytest.mark.timeout(60)
-def test_a_folder_under_itself_is_damaged_and_holds_nobody_up(tmp_path: Path, store: Store, parents: str) -> None:
-    for child, parent in zip(parents[::2], parents[1::2], strict=True):
-        folder = tmp_path / "runs" / child
-        Journal(folder).status("FINISHED")
-        (folder / "commit.json").write_bytes(
-            (folder / "commit.json").read_bytes().replace(b'"parent":""', f'"parent":"../../runs/{parent}"'.encode())
-        )
-    with pytest.raises(ValueError, match="its own parent"):
-        publish(tmp_path / "runs" / "a", store)
-
-
-def test_what_begins_anew_is_published_where_the_store_has_lost_its_run(tmp_path: Path, store: Store) -> None:
-    note = tmp_path / "published.json"
-    for _ in range(2):  # as a comparison does each time
-        journal = Journal(tmp_path)
-        journal.metrics({"score": 1.0}, 1)
-        journal.finish()
-        assert publish(tmp_path, store)
-        note.write_text(note.read_text().replace(run_id(tmp_path), "a" * 32))
-
-
-@pytest.mark.timeout(100)
-def test_what_is_a_folders_own_fault_is_one_line_at_once_and_no_reason_to_leave_the_others(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    folders = {name: tmp_path / "runs" / name for name in ("label", "lock", "step", "whole")}
-    for name, folder in folders.items():
-        journal = Journal(folder, {"a_b": "x"})
-        journal.metrics({"score": 1.0}, 2**63 if name == "step" else 1)
-        journal.finish()
-        Cursor(Store(tmp_path).address, read_commit(folder).identity).save(folder / "published.json")  # type: ignore[union-attr]
-    mark = folders["label"] / "commit.json"
-    mark.write_bytes(mark.read_bytes().replace(b"a_b", b"a//b"))
-    (folders["lock"] / "published.lock").symlink_to("elsewhere")
-    began = time.monotonic()
-    catch_up(tmp_path)
-    assert time.monotonic() - began < 18  # it would wait 20 s for a store
-    assert unfinished(folders["whole"], tmp_path) is None
-    said = [record.getMessage() for record in caplog.records if record.name == store_module.__name__]
-    assert [line.split(" (")[0] for line in said] == [
-        f"runs/{name} cannot be published" for name in ("label", "lock", "step")
-    ]
-
-
-@pytest.mark.parametrize("damaged", ["", "{", '{"store": "a", "identity": "b", "offset": "many"}'])
-def test_a_damaged_note_of_what_was_sent_doubles_nothing(
-    tmp_path: Path, root: Path, store: Store, damaged: str
-) -> None:
-    a_full_journal(tmp_path)
-    publish(tmp_path, store)
-    shown = everything(root, tmp_path)
-    (tmp_path / "published.json").write_text(damaged)
-    publish(tmp_path, store)
-    assert everything(root, tmp_path) == shown
-
-
-def test_a_note_from_before_its_key_was_renamed_is_understood(tmp_path: Path, store: Store) -> None:
-    a_full_journal(tmp_path)
-    publish(tmp_path, store)
-    note = json.loads((tmp_path / "published.json").read_bytes())
-    note["standing"] = note.pop("files")
-    (tmp_path / "published.json").write_text(json.dumps(note))
-    assert unfinished(tmp_path, store._root) is None
-    assert not publish(tmp_path, store)
 
 
 def test_runs_are_found_by_name_with_their_folder(tmp_path: Path, store: Store) -> None:
@@ -709,57 +34,10 @@ def test_runs_are_found_by_name_with_their_folder(tmp_path: Path, store: Store) 
         commit(journal)
         publish(tmp_path / name, store)
     [found] = store.runs("resnet-1")
-    assert (found.folder, found.params, found.status) == (tmp_path / "resnet-1", {"seed": "1"}, "RUNNING")
-    assert {"resnet-0", "resnet-1"} <= {run.name for run in store.runs()}
+    shown = found.data.tags["atlantis.folder"], found.data.params, found.info.status
+    assert shown == (str(tmp_path / "resnet-1"), {"seed": "1"}, "RUNNING")
+    assert {"resnet-0", "resnet-1"} <= {run.info.run_name for run in store.runs()}
     assert store.runs("nobody") == []
-
-
-def test_everything_arrives_after_another_writer_held_the_database(tmp_path: Path, root: Path, store: Store) -> None:
-    a_full_journal(tmp_path).status("FINISHED")
-    assert store.client
-    with closing(sqlite3.connect(root / "mlflow.db", isolation_level=None)) as writer:
-        writer.execute("BEGIN IMMEDIATE")
-        publisher = Publisher(tmp_path, store)
-        assert not publisher.drain(1.0)
-        assert run_id(tmp_path) == ""
-        writer.execute("ROLLBACK")
-    assert publisher.drain(120)
-    assert everything(root, tmp_path)["metrics"] == journaled_points(tmp_path)
-
-
-def test_a_store_out_of_reach_is_reported_once_and_caught_up_with_once_it_is_back(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root, folder = tmp_path / "store", tmp_path / "run"
-    monkeypatch.chdir(tmp_path)
-    attempts: list[None] = []
-    failed = threading.Event()
-
-    def counted(folder: Path, store: Store) -> None:
-        attempts.append(None)
-        if len(attempts) > 2:
-            failed.set()
-        publish(folder, store)
-
-    monkeypatch.setattr(store_module, "publish", counted)
-    root.write_text("in the way")
-    journal = a_full_journal(folder)
-    publisher = Publisher(folder, Store(root), interval=0.01)
-    assert failed.wait(120)
-    journal.metrics({"score": 1}, 200)
-    commit(journal)
-    assert not publisher.drain(0.1)
-    root.unlink()
-    assert publisher.drain(120)
-    assert points(root, folder) == journaled_points(folder)
-    said = [record.getMessage() for record in caplog.records if record.name == store_module.__name__]
-    assert [line.split(" (")[0] for line in said] == [
-        "Publishing to MLflow fails",
-        "Publishing to MLflow works again and is up to date",
-    ]
-    assert rows(root, "PRAGMA journal_mode") == [("wal",)]
-    assert [str(path.relative_to(root)) for path in root.glob("artifacts/*")] == ["artifacts/atlantis"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "store"]  # nothing in the working directory
 
 
 @pytest.mark.slow
@@ -788,9 +66,11 @@ Store(Path({str(tmp_path)!r})).client
 def test_eight_processes_start_on_a_fresh_store_at_once(tmp_path: Path) -> None:
     script = f"""
 import sys
+import time
 from pathlib import Path
 from atlantis_exp.runs.journal import Journal
-from atlantis_exp.tracking.store import Store, publish
+from atlantis_exp.tracking.mirror import publish
+from atlantis_exp.tracking.store import Store
 folder = Path({str(tmp_path)!r}, sys.argv[1])
 journal = Journal(folder)
 journal.metrics({{"score": 1.0}}, 1)
@@ -808,20 +88,65 @@ publish(folder, Store(Path({str(tmp_path)!r}, "store")))
     assert rows(tmp_path / "store", "SELECT count(*) FROM experiments WHERE name = 'atlantis'") == [(1,)]
 
 
-def test_a_file_that_is_newer_than_the_commit_waits_for_its_own(tmp_path: Path, root: Path, store: Store) -> None:
-    def film() -> bytes:
-        (place,) = (root / "artifacts").rglob(f"{run_id(tmp_path)}/artifacts/film.mp4")
-        return place.read_bytes()
+def test_an_experiment_that_was_deleted_is_restored_and_a_line_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "runs" / "run"
+    journal = a_full_journal(folder)
+    publish(folder, store := Store(tmp_path))
+    store.client.delete_experiment(store.experiment_id)
+    journal.status("FINISHED")
+    publish(folder, Store(tmp_path))
+    assert rows(tmp_path, "SELECT status, lifecycle_stage FROM runs") == [("FINISHED", "active")]
+    assert [record.getMessage() for record in caplog.records] == [
+        "The MLflow experiment atlantis had been deleted: it is restored, with its runs"
+    ]
 
-    journal = Journal(tmp_path)
-    journal.artifact("film.mp4", b"first")
-    journal.flush()
-    publish(tmp_path, store)
-    journal.artifact("film.mp4", b"second")
-    journal.flush()
-    journal.artifact("film.mp4", b"third")  # a kill here leaves it on disk, and no record of it
-    publish(tmp_path, store)
-    assert film() == b"first"
-    journal.flush()
-    publish(tmp_path, store)
-    assert film() == b"third"
+
+def damage(database: Path) -> None:
+    database.write_bytes(b"no database" * 1_000)
+
+
+def age(database: Path) -> None:
+    with closing(sqlite3.connect(database)) as opened, opened:
+        opened.execute("UPDATE alembic_version SET version_num = '6953534de441'")
+
+
+def renew(database: Path) -> None:
+    with closing(sqlite3.connect(database)) as opened, opened:
+        opened.execute("UPDATE alembic_version SET version_num = 'ffffffffffff'")
+
+
+@pytest.mark.parametrize("spoil", [damage, age, renew])
+def test_a_database_that_cannot_be_used_is_one_line_with_the_remedy_for_every_command(
+    tmp_path: Path,
+    mlflow_tables: Callable[[Path], None],
+    caplog: pytest.LogCaptureFixture,
+    spoil: Callable[[Path], None],
+) -> None:
+    mlflow_tables(tmp_path)
+    spoil(tmp_path / "mlflow.db")
+    folder = tmp_path / "runs" / "run"
+    a_full_journal(folder)
+    remedy = rf"move it away, and .* sync paths.outputs={tmp_path} makes it again"
+    said = rf"{tmp_path}/mlflow.db cannot be used \(.*\): {remedy}"
+    with pytest.raises(Fault, match=said):
+        [*publish_all(tmp_path, Store(tmp_path))]
+    with pytest.raises(Fault, match=said):
+        Store(tmp_path).prepare()
+    Publisher(folder, Store(tmp_path))
+    line = rf"Publishing to MLflow fails \({said}\); the run goes on and is published later"
+    patience = time.monotonic() + 120
+    while not any(re.fullmatch(line, record.getMessage()) for record in caplog.records):
+        assert time.monotonic() < patience
+        time.sleep(0.05)
+
+
+def test_a_database_that_breaks_while_it_is_used_is_the_stores_fault(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    assert store.client
+    error = MlflowException("(sqlite3.DatabaseError) database disk image is malformed")
+    assert "move it away" in str(store.fault(error))
+    assert "move it away" in str(store.fault(sqlite3.DatabaseError("database disk image is malformed")))
+    assert store.fault(ValueError("a folder's own")) is None
+    assert store.fault(OverflowError("too large")) is None

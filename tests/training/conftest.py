@@ -146,6 +146,7 @@ def small() -> Callable[..., Trainer]:
         learner = learner_of(seed)
         memory = ReplayMemory(capacity, (SIZE, SIZE), stack=STACK, budget_bytes=BUDGET)
         evaluator = Evaluator(
+            most_frames=1_000,
             make_emulators=partial(emulators_of, steps=episode_steps),
             make_emulator=cast(Callable[[], Emulator], Game),
             epsilon=0.05,

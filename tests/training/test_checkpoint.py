@@ -228,6 +228,20 @@ def test_frequent_saves_leave_no_crumbs(tmp_path: Path) -> None:
     assert same(restored(tmp_path)[1], memory)
 
 
+def test_the_generation_before_the_newest_has_its_whole_memory_whatever_the_newest_shares_of_it(tmp_path: Path) -> None:
+    checkpoints, memory, before = Checkpoints(tmp_path, "abc"), memory_of(1), None
+    for end in (3, 5, 40, 44, 300, 640, 645, 700, 1_500, 1_503):  # some rewrite a segment, some forget one
+        checkpoints.save({"step": end}, memory_of(end, of=memory))
+        newest = max(tmp_path.glob("0*/manifest.json"))
+        aside = newest.rename(newest.with_name("aside"))
+        state, older, said = restored(tmp_path)
+        aside.rename(newest)
+        if before is not None:
+            assert (state, said) == ({"step": before["step"]}, [])
+            assert all(np.array_equal(value, before[name]) for name, value in older.state_dict().items())
+        before = {"step": end, **memory.state_dict()}
+
+
 def test_a_save_that_the_disk_refuses_leaves_the_last_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     checkpoints, memory = Checkpoints(tmp_path, "abc"), memory_of(100)
     checkpoints.save({"step": 1}, memory)

@@ -55,7 +55,10 @@ def test_a_network_evaluated_twice_plays_twice_the_same(tiny: Compose, played: C
 
 def test_more_environments_than_episodes_play_each_episode_once(played: Callable[..., Evaluation]) -> None:
     told: list[tuple[list[int], int]] = []
-    play = partial(played, on_step=lambda episodes, over: told.append(([each.steps for each in episodes], over)))
+    play = partial(
+        played,
+        on_step=lambda episodes: told.append(([each.steps for each in episodes], sum(each.over for each in episodes))),
+    )
     assert len({episode.seed for episode in play(3, episodes=2).episodes}) == 2
     steps = [[step, step - behind] for step in range(1, 26) for behind in (1, 0)]
     assert told == [(each, each.count(25)) for each in steps]

@@ -26,7 +26,7 @@ Compose = Callable[..., Config]
 def played(tiny: Compose) -> Callable[..., Episode]:
     def play(actor: Actor | None = None) -> Episode:
         env = tiny("env.max_steps=25").env
-        with build_emulators(env, 1) as emulators:
+        with build_emulators(env, 1, 1) as emulators:
             player = actor or RandomActor(4)
             return evaluate(player, emulators, episodes=4, epsilon=0.5, seed=5, size=env.size, stack=env.stack).best
 
@@ -98,7 +98,7 @@ def test_a_film_of_a_part_shows_that_part_and_says_how_far_it_is(tiny: Compose, 
 
 def test_a_film_is_given_up_once_that_is_asked_for(tiny: Compose) -> None:
     config, progress, asked = tiny("env.max_steps=25", "evaluation.video=all"), Progress(Console(quiet=True)), count()
-    evaluator = build_evaluator(config.env, config.evaluation)
+    evaluator = build_evaluator(config.env, config.evaluation, 1)
     played = evaluator(RandomActor(4), 2, progress)
     with pytest.raises(Stopped):
         evaluator.film(played, progress, lambda: next(asked) == 3)

@@ -86,7 +86,7 @@ def test_a_real_training_is_none_the_wiser_of_forecasts_at_its_start_and_when_it
     expected_of(first, size)
     first.run(lambda: first.counters.steps >= 60)
 
-    second = build_trainer(config, tmp_path / "with", Journal(tmp_path / "with"), Progress(Console(quiet=True)))
+    second = build_trainer(config, 1, tmp_path / "with", Journal(tmp_path / "with"), Progress(Console(quiet=True)))
     with second.emulators:
         state = second.checkpoints.load(second.memory)
         assert state is not None

@@ -31,14 +31,19 @@ def test_an_evaluation_says_how_far_it_is_now_and_then(clock: Clock, monkeypatch
     monkeypatch.setattr("time.monotonic", clock)
     progress = Progress(Console(file=text, width=300))
     episodes = [Episode(0, 1_200.0), Episode(1), Episode(2)]
-    for over in range(7):
+    for step in range(60):
+        episodes[0].over = step >= 30
         episodes[1].actions.append(0)
-        progress.evaluating(episodes, over // 3)
+        episodes[1].frames += 10
+        progress.evaluating(episodes, 1_000)
         clock.now += 2
     assert text.getvalue().splitlines() == [
-        "  evaluation: 0 of 3 episodes over, 3 steps, highest score 1,200",
-        "  evaluation: 1 of 3 episodes over, 5 steps, highest score 1,200",
-        "  evaluation: 2 of 3 episodes over, 7 steps, highest score 1,200",
+        "  evaluation: 0 of 3 episodes over, 3 steps, highest score 1,200, at most 0:06:36 left",
+        "  evaluation: 0 of 3 episodes over, 7 steps, highest score 1,200, at most 0:08:22 left",
+        "  evaluation: 0 of 3 episodes over, 15 steps, highest score 1,200, at most 0:08:52 left",
+        "  evaluation: 0 of 3 episodes over, 30 steps, highest score 1,200, at most 0:08:42 left",
+        "  evaluation: 1 of 3 episodes over, 45 steps, highest score 1,200, at most 0:01:34 left",
+        "  evaluation: 1 of 3 episodes over, 60 steps, highest score 1,200, at most 0:01:43 left",
     ]
 
 

@@ -268,22 +268,19 @@ def test_updates_are_those_that_a_naive_loop_counts(
 
 
 @pytest.mark.parametrize("num_envs", [1, 8])
-@pytest.mark.slow
-def test_a_prioritized_training_is_the_same_whenever_it_is_committed(
+def test_a_prioritized_training_continued_every_few_steps_is_the_unbroken_one(
     small: Small, tmp_path: Path, num_envs: int
 ) -> None:
     """With eight environments several updates fall due at once, and the memory forgets what awaits its error."""
     prints = []
-    for name, seconds in (("every-step", 0.0), ("at-the-end", 1e9)):
-        trainer = small(
-            tmp_path / name,
-            num_envs=num_envs,
-            phases=phases(160, PrioritizedSampler(0.5, 0.5)),
-            capacity=70,
-            learn_every=2,
-            commit_seconds=seconds,
-        )
-        trainer.run()
+    for name, few in (("unbroken", 1_000), ("broken", 7)):
+        outcome = ""
+        while outcome != "finished":
+            prioritized = phases(160, PrioritizedSampler(0.5, 0.5))
+            trainer = small(
+                *(tmp_path / name,), num_envs=num_envs, phases=prioritized, capacity=70, learn_every=2, **NEVER
+            )
+            outcome = trainer.run(after(few))
         prints.append(print_of(trainer, tmp_path / name))
     assert prints[0] == prints[1]
 
@@ -348,13 +345,14 @@ def test_a_plan_in_episodes_ends_with_its_last_episode(small: Small, tmp_path: P
 
 
 def test_a_loss_that_is_no_number_stops_the_run_at_its_last_good_commit(small: Small, tmp_path: Path) -> None:
-    trainer = small(tmp_path, curve_steps=1_000)
+    quiet = {"curve_steps": 1_000, **NEVER}  # nothing but the commit asks for the loss
+    trainer = small(tmp_path, **quiet)
     trainer.run(after(100))
     good = print_of(trainer, tmp_path)
     next(trainer.learner.network.parameters()).data[:] = np.nan
     with pytest.raises(Diverged, match=f"update {trainer.learner.updates} is no finite number"):
         trainer.run()
-    assert print_of(small(tmp_path, curve_steps=1_000), tmp_path) == good
+    assert print_of(small(tmp_path, **quiet), tmp_path) == good
 
 
 def test_a_network_that_has_diverged_is_not_evaluated(small: Small, tmp_path: Path) -> None:

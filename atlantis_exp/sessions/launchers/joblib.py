@@ -1,77 +1,100 @@
-"""Jobs side by side on this machine, each in a process of its own: whatever ends it, the others go on."""
+"""Jobs side by side on this machine, each in a process of its own: if one ends, the others go on."""
 
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
-from multiprocessing import resource_tracker
+from types import FrameType
+from typing import NoReturn
 
+from atlantis_exp import terminal
 from atlantis_exp.faults import Fault
+from atlantis_exp.machine import JOB_OF, all_cores
 from atlantis_exp.runs.files import make_folder, no_link
 from atlantis_exp.runs.folder import OUTPUT, RunFolder
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
-from atlantis_exp.sessions.launchers import APART, JOB_OF, Launcher, committed_at_the_end
-from atlantis_exp.sessions.stopping import sweep_goes_on
+from atlantis_exp.sessions.launchers import Launcher
 
 
-@contextmanager
-def jobs(
-    journal: Journal, trainings: Sequence[Job], close_page: Callable[[], None], launcher: Launcher
-) -> Iterator[None]:
-    """Share the cores among the workers that the block starts, and have all jobs commit at its end."""
-    from joblib.externals.loky.backend import resource_tracker as its_own
+class _Running:
+    """The processes of the jobs under way, which SIGINT and SIGTERM of the sweep have commit and end."""
 
-    with _shared_cores(launcher, trainings):
-        for tracker in (resource_tracker, its_own):
-            tracker.ensure_running()  # started later, it would lift the mask
-        # A worker that a signal ends would take all others along: they inherit the mask. The signals reach this
-        # process all the same, through its other threads.
-        folders = [RunFolder.of(job.config) for job in trainings]
-        with committed_at_the_end(journal, folders, close_page, is_masked=True):
+    def __init__(self, environment: Mapping[str, str]) -> None:
+        self.environment = environment
+        self.has_ended = False
+        self.processes: set[subprocess.Popen[str]] = set()
+
+    @contextmanager
+    def ended_by_signals(self) -> Iterator[None]:
+        def end(number: int, _: FrameType | None) -> NoReturn:
+            signal.signal(number, signal.SIG_DFL)  # a second one ends this process at once
+            self.has_ended = True
+            terminal.warn(f"{signal.Signals(number).name}: the jobs commit and end")
+            for process in [*self.processes]:
+                process.terminate()
+            sys.exit(128 + number)
+
+        handlers = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
             yield
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
 
 
-@contextmanager
-def _shared_cores(launcher: Launcher, trainings: Sequence[Job]) -> Iterator[None]:
-    """Tell the workers their share of the cores, unless a person has."""
-    if "OMP_NUM_THREADS" in os.environ:
-        yield
-        return
-    from joblib import cpu_count, effective_n_jobs
+def train_side_by_side(jobs: Sequence[Job], launcher: Launcher) -> None:
+    """Train jobs, as many at a time as the launcher says and the cores divided among them.
 
-    left = sum(RunFolder.of(job.config).ended(job.config.budget.steps) is None for job in trainings)
-    at_once = min(effective_n_jobs(launcher.n_jobs), left)
-    share = str(max(cpu_count() // max(at_once, 1), 1))
-    os.environ |= {"OMP_NUM_THREADS": share, "MKL_NUM_THREADS": share}
-    try:
-        yield
-    finally:
-        del os.environ["OMP_NUM_THREADS"], os.environ["MKL_NUM_THREADS"]
+    Raises:
+        Fault: the first job's that failed, once all have ended.
+    """
+    at_once, share = shared(all_cores(), launcher.settings["n_jobs"], jobs)
+    # A person's own number of threads goes before.
+    running = _Running({"OMP_NUM_THREADS": f"{share}", "MKL_NUM_THREADS": f"{share}", **os.environ, JOB_OF: "joblib"})
+    with running.ended_by_signals(), ThreadPoolExecutor(at_once, "job") as pool:
+        futures = [pool.submit(_train_apart, job, running) for job in jobs]
+        try:
+            wait(futures)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    for future in futures:
+        future.result()
 
 
-def train_apart(job: Job) -> None:
+def shared(cores: int, n_jobs: int, jobs: Sequence[Job]) -> tuple[int, int]:
+    """Return how many jobs are trained at a time, and the cores of each.
+
+    n_jobs: at a time; below zero, that many fewer than one a core and one more, as joblib counts them.
+    """
+    left = sum(RunFolder.of(job.config).ended(job.config.budget.steps) is None for job in jobs)
+    at_once = max(min(n_jobs if n_jobs > 0 else cores + 1 + n_jobs, left), 1)
+    return at_once, max(cores // at_once, 1)
+
+
+def _train_apart(job: Job, running: _Running) -> None:
     """Train in a process of its own. Raises: Fault where the run fails."""
     config, folder = job.config, RunFolder.of(job.config)
     if folder.ended(config.budget.steps) is not None:
         return
-    if not sweep_goes_on(folder, job.launcher)():
-        raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
     make_folder(folder.path)
     with open(folder.path / OUTPUT, "a+", opener=no_link) as output:
         start = output.tell()
-        code = subprocess.run(
-            [sys.executable, "-m", "atlantis_exp", "train", *job.overrides],
-            env={**os.environ, JOB_OF: APART},
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=output,
-            check=False,
-        ).returncode
-        if folder.parent and not RunFolder(folder.parent).is_held:
-            os._exit(code)  # the process that this worker works for was killed: there is nobody to tell
+        if running.has_ended:
+            raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
+        command = [sys.executable, "-m", "atlantis_exp", "train", *job.overrides]
+        process = subprocess.Popen(
+            command, env=running.environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output, text=True
+        )
+        running.processes.add(process)
+        if running.has_ended:  # meanwhile
+            process.terminate()
+        code = process.wait()
+        running.processes.discard(process)
         output.seek(start)
         said = output.read().splitlines()
     if code == 0:

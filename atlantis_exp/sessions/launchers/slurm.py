@@ -1,24 +1,73 @@
-"""Jobs of Slurm's, as their sweep's process sees them and as they are themselves."""
+"""Jobs of a Slurm cluster, by submitit: what the sweep's process submits and waits for, and what a job does."""
 
 import signal
 import sys
 import time
-from collections.abc import Iterator
+import traceback
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
 
 from atlantis_exp import terminal
 from atlantis_exp.faults import Fault
 from atlantis_exp.sessions.job import Job
-from atlantis_exp.sessions.launchers import as_one_line
+from atlantis_exp.sessions.launchers import Launcher
 
 _LOOK_SECONDS = 5.0  # between two questions to Slurm
+_SHARED = {  # settings that submitit has for every kind of cluster
+    *("name", "timeout_min", "cpus_per_task", "gpus_per_node", "tasks_per_node", "mem_gb", "nodes", "stderr_to_stdout"),
+}
+
+Train = Callable[[Sequence[str]], None]  # what the overrides of one job ask for
+
+
+@dataclass(frozen=True)
+class _Training:
+    """A job as it is pickled for a node of the cluster."""
+
+    train: Train
+
+    def __call__(self, overrides: Sequence[str]) -> Fault | None:
+        """Train; returns why it failed, which is then not counted as a failure of the node."""
+        try:
+            self.train(overrides)
+        except (Fault, OSError) as error:
+            return error if isinstance(error, Fault) else Fault(str(error))
+        except Exception as error:
+            traceback.print_exc()
+            return Fault(f"{' '.join(overrides)}: {type(error).__name__}: {error}")
+        return None
+
+    def checkpoint(self, *arguments: Any) -> Any:
+        """Return what submitit is to submit again when the job is preempted or its time is up: the same."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self, *arguments)
+
+
+def submit(jobs: Sequence[Job], launcher: Launcher, train: Train) -> None:
+    """Submit jobs as one array and wait for them. Raises: Fault, of the first job that failed once all have ended."""
+    from submitit import AutoExecutor
+
+    settings = dict(launcher.settings)
+    folder = jobs[0].outputs / "sweeps" / time.strftime("%Y-%m-%d_%H-%M-%S")
+    folder.mkdir(parents=True, exist_ok=True)
+    most_sessions = settings.pop("max_num_timeout")
+    executor = AutoExecutor(folder / "%j", cluster="slurm", slurm_max_num_timeout=most_sessions)
+    executor.update_parameters(**{key if key in _SHARED else f"slurm_{key}": value for key, value in settings.items()})
+    print(f"what the jobs print is in {folder}", flush=True)
+    submitted = executor.map_array(_Training(train), [job.overrides for job in jobs])
+    for fault in [job.result() for job in submitted]:
+        if fault is not None:
+            raise fault
 
 
 @contextmanager
 def all_awaited() -> Iterator[None]:
-    """Wait for the other jobs where one that was cancelled or killed ends the launcher's own waiting.
+    """Wait for the other jobs where one that was cancelled or killed ends the waiting for results.
 
-    Whoever interrupts the waiting reads that the jobs go on.
+    An interrupt ends the waiting and says that the jobs go on.
 
     Raises:
         Fault: names that job, or says why Slurm took none.
@@ -39,11 +88,3 @@ def all_awaited() -> Iterator[None]:
     except (KeyboardInterrupt, SystemExit) as left:
         terminal.warn(f"the jobs go on; {terminal.PROGRAM} sync publishes what they do")
         sys.exit(getattr(left, "code", 128 + signal.SIGINT))
-
-
-def train_as_job(job: Job) -> None:
-    """Train as a job of Slurm's, or of whatever else has started this process. Raises: Fault where the run fails."""
-    from atlantis_exp.sessions.training import train  # and torch, which the sweep does without
-
-    with as_one_line(job.config.run_name()):
-        train(job)

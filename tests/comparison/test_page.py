@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from atlantis_exp.comparison.choosing import group
 from atlantis_exp.comparison.figures import Drawn, draw
-from atlantis_exp.comparison.gather import gather, group
-from atlantis_exp.comparison.report import COLUMNS, EXPLAINED, number, page
+from atlantis_exp.comparison.gather import gather
+from atlantis_exp.comparison.page import COLUMNS, EXPLAINED, number, page
 from atlantis_exp.comparison.tables import Comparison, compare
 from atlantis_exp.comparison.verdict import Question
 
@@ -106,7 +107,7 @@ def test_the_page_says_the_verdict_the_notes_and_every_shown_table(
 def test_a_term_in_a_header_is_explained_and_nothing_else_is(comparison: Comparison, figures: dict[str, Drawn]) -> None:
     shown = {title for columns in COLUMNS.values() for title in columns.values()}
     assert set(EXPLAINED) <= shown
-    assert {"score", "human-normalised", "probability of improvement", "FLOPs"} <= set(EXPLAINED)
+    assert {"IQM", "mean of IQMs", "human-normalised", "probability of improvement", "FLOPs"} <= set(EXPLAINED)
     headers = [attributes for tag, attributes in Tags(page(comparison, figures, {})).found if tag == "th"]
     said = {attributes["title"] for attributes in headers if "title" in attributes}
     assert EXPLAINED["probability of improvement"] in said
@@ -216,8 +217,8 @@ def test_a_comparison_without_curves_has_the_other_figures(recorded: Recorded, t
 
 def test_comparing_loads_no_torch() -> None:
     program = (
-        "import sys; from atlantis_exp.comparison import comparing, figures, gather, report, tables; "
-        "print('torch' in sys.modules, 'mlflow' in sys.modules)"
+        "import sys; from atlantis_exp.comparison import figures, gather, page, tables; "
+        "from atlantis_exp.sessions import comparing; print('torch' in sys.modules, 'mlflow' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "False False\n"

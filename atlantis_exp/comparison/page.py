@@ -1,6 +1,6 @@
-"""Comparison to page: one HTML file that needs nothing else, and its tables as CSV."""
+"""Write a comparison as a page: one HTML file that needs no other; and say how its tables are shown."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 
 from jinja2 import Environment, StrictUndefined
@@ -11,7 +11,7 @@ from atlantis_exp.comparison.tables import Comparison
 
 
 def page(comparison: Comparison, figures: Mapping[str, Drawn], facts: Mapping[str, str]) -> str:
-    """The HTML page of a comparison; `facts` say how and when it was made. Whatever comes from data is escaped."""
+    """Return the HTML page; `facts` say how and when it was made. Everything from data is escaped."""
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
     template = environment.from_string((files("atlantis_exp.comparison") / "page.html").read_text("utf-8"))
     return template.render(
@@ -19,7 +19,8 @@ def page(comparison: Comparison, figures: Mapping[str, Drawn], facts: Mapping[st
         tables=comparison.tables,
         figures=figures,
         facts=facts,
-        titles=titles,
+        shown_columns=shown_columns,
+        label=label,
         cells=cells,
         explained=EXPLAINED,
     )
@@ -29,7 +30,7 @@ _EPISODES = {"episodes": "episodes", "mean": "mean", "median": "median", "low": 
 _DIFFERENCE = {"difference": "difference", "said": "verdict"}
 
 COLUMNS = {
-    "scores": {"family": "by", "group": "group", "seeds": "seeds", "score": "score", **_DIFFERENCE},
+    "scores": {"family": "by", "group": "group", "seeds": "seeds", "score": "mean of IQMs", **_DIFFERENCE},
     "verdict": {"family": "by", "group": "group", "other": "against", **_DIFFERENCE, "seeds": "seeds each"},
     "plan": {
         "family": "by",
@@ -90,39 +91,12 @@ COLUMNS = {
         "hours": "hours",
         "flops": "FLOPs",
         "epsilon": "epsilon",
-        "score": "score",
+        "score": "IQM",
         **_EPISODES,
         "policy": "policy",
         "same_as": "plays as",
     },
     "actions": {"group": "group", "action": "action", "network": "network", "random": "chance"},
-    "probes": {
-        "group": "group",
-        "run": "its run",
-        "other": "against",
-        "other_run": "its run",
-        "states": "states",
-        "equal_actions": "equal actions",
-        "equal_by_chance": "by chance",
-        "equal_where_clear": "where both are clear",
-        "advantage_distance": "distance of advantages",
-        "state_value_correlation": "rank correlation of state values",
-    },
-    "partings": {
-        "group": "group",
-        "other": "against",
-        "seed": "seed of the game",
-        "outcome": "outcome",
-        "step": "at step",
-        "frame": "frame",
-        "score": "score so far",
-        "action": "group chose",
-        "other_action": "other chose",
-        "values": "group's values",
-        "other_values": "other's values",
-        "later_score": "group's score at the film's end",
-        "other_later_score": "other's",
-    },
     "references": {
         "name": "player",
         "score": "mean score",
@@ -132,11 +106,12 @@ COLUMNS = {
     },
     "skipped": {"run": "run", "reason": "why it is left out"},
 }
-"""The tables that the page shows: their columns and how a person calls them."""
+"""The tables that the page shows: each column and its title."""
 
 EXPLAINED = {
     "by": "the key whose values are compared, averaged over the others",
-    "score": "of a seed: the interquartile mean of its evaluated episodes; of a group: the mean over its seeds",
+    "IQM": "the interquartile mean of a seed's evaluated episodes: the seed's score",
+    "mean of IQMs": "a group's score: the mean over its seeds of the interquartile means of their episodes",
     "seeds each": "seeds of each of the two groups that the verdict rests on",
     "verdict": "better, worse, equivalent within delta, or not decided",
     "look": "a planned glance at the seeds so far, which spends a share of the error",
@@ -154,15 +129,12 @@ EXPLAINED = {
     "policy": "the action that the network chose most in evaluation; collapsed: it chose one only",
     "plays as": "a run with the same score in every episode",
     "chance": "the share of steps whose action was drawn at random",
-    "by chance": "the share of equal actions if both chose independently, each as often as it does",
-    "distance of advantages": "the mean difference of normalised action values: 0 if equal, about 1.1 if unrelated",
-    "rank correlation of state values": "Spearman's, of the highest action values over the states",
 }
-"""What a header's term means, in a sentence."""
+"""A sentence on a title."""
 
 SHARES = {
     *("time_cap_share", "truncated_share", "random_share", "upper_share", "share", "probability", "network", "random"),
-    *("human_normalised_mean", "error", "spent", "equal_actions", "equal_by_chance", "equal_where_clear"),
+    *("human_normalised_mean", "error", "spent"),
 }
 """The columns that are shares and probabilities, from 0 to 1."""
 _ENDS = {
@@ -173,53 +145,46 @@ _ENDS = {
 """The columns of a table that have an interval, and those of its ends."""
 
 
-def titles(name: str, table: Table) -> list[str]:
-    """The header of a shown table."""
-    return [label(name, column) for column in shown_columns(name, table)]
-
-
 def label(name: str, column: str) -> str:
-    """How a person calls a column of a shown table."""
-    return COLUMNS[name].get(column, column.replace("_", " "))
-
-
-def cells(name: str, row: Row, table: Table) -> list[tuple[str, bool]]:
-    """A row of a shown table as texts, intervals included, and whether each is a number."""
-    texts = []
-    for column in shown_columns(name, table):
-        value = row[column]
-        text = number(value, column)
-        low, high = _ENDS.get((name, column), ("", ""))
-        if low and row[low] == row[low]:
-            text += f" ({number(row[low], column)} to {number(row[high], column)})"
-        texts.append((text, isinstance(value, int | float) and not isinstance(value, bool)))
-    return texts
+    """Return the title of a column."""
+    return COLUMNS.get(name, {}).get(column, column.replace("_", " "))
 
 
 def shown_columns(name: str, table: Table) -> list[str]:
-    """The columns of a table that are shown: without a baseline no differences to one, of one family not its name.
+    """Return the columns that are shown: no differences without a baseline, no family if there is one.
 
-    Of `why` there are further ones: what pays points in the game.
+    `why` has further ones: the sources of points in the game. A table that is not the page's has all but the ends of
+    intervals, which are written with their values.
     """
-    hidden = set()
+    keys = [*dict.fromkeys(key for row in table for key in row)]
+    if name not in COLUMNS:
+        return [key for key in keys if not any(key in (f"{other}_low", f"{other}_high") for other in keys)]
+    hidden = {"family"} if len({row.get("family") for row in table}) == 1 else set()
     if name == "scores" and not any(row["baseline"] for row in table):
         hidden |= {"difference", "said"}
-    if len({row.get("family") for row in table}) == 1:
-        hidden.add("family")
-    if table:
-        hidden |= COLUMNS[name].keys() - table[0].keys()
-    more = [column for column in table[0] if column not in COLUMNS[name]] if name == "why" and table else []
-    return [column for column in (*COLUMNS[name], *more) if column not in hidden]
+    further = [key for key in keys if key not in COLUMNS[name]] if name == "why" else []
+    return [key for key in (*COLUMNS[name], *further) if key in keys and key not in hidden]
+
+
+def cells(name: str, row: Row, columns: Sequence[str]) -> list[tuple[str, bool]]:
+    """Return a row's columns as texts with intervals, and whether each is a number."""
+    texts = []
+    for column in columns:
+        text, ends = number(row.get(column), column), _ENDS.get((name, column), (f"{column}_low", f"{column}_high"))
+        low, high = (number(row.get(end), column) for end in ends)
+        is_number = bool(text) and isinstance(row[column], int | float) and not isinstance(row[column], bool)
+        texts.append((f"{text} ({low} to {high})" if low else text, is_number))
+    return texts
 
 
 def number(value: object, column: str = "") -> str:
-    """A table's value as a person reads it."""
+    """Return a table's value as a person reads it."""
     if isinstance(value, bool):
         return "yes" if value else "no"
+    if value is None or value != value:
+        return ""
     if not isinstance(value, int | float):
         return str(value)
-    if value != value:
-        return ""
     if column in ("error", "spent"):
         return f"{value:.2%}"
     if column in SHARES:
@@ -232,5 +197,7 @@ def number(value: object, column: str = "") -> str:
 
 
 def plain(name: str, table: Table) -> list[list[str]]:
-    """A shown table as texts, header first."""
-    return [titles(name, table), *([text for text, _ in cells(name, row, table)] for row in table)]
+    """Return a shown table as texts, header first."""
+    columns = shown_columns(name, table)
+    header = [label(name, column) for column in columns]
+    return [header, *([text for text, _ in cells(name, row, columns)] for row in table)]

@@ -10,11 +10,13 @@ from pathlib import Path
 
 import pytest
 
+from atlantis_exp.commands import CHECKOUT, CONF
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.components import ENTRY_POINTS, KINDS, admit
 from atlantis_exp.config import Config
 from atlantis_exp.sessions.contracts import trials
 from atlantis_exp.sessions.job import Job, replaced
+from atlantis_exp.sessions.new import EXAMPLES, begin
 
 
 @pytest.fixture(autouse=True)
@@ -41,17 +43,46 @@ def test_what_is_written_keeps_every_contract(
     for path in folder.rglob("*.py"):
         compile(path.read_text(), path, "exec")
 
-    yaml = folder / "atlantis_my_own" / "conf" / kind / "my_own.yaml"
-    first, *_ = yaml.read_text().splitlines()
     words = [*tiny_overrides, f"{kind}=my_own", f"plugins={source}"]
     ((_, config),) = check("config", Config, words).items()
-    assert getattr(config, kind).settings[first.split(":")[0]] == float(first.split(":")[1])
-    for _, contract, trial in trials(config, Job(config)):
+    assert getattr(config, kind).component.load().__name__.startswith("MyOwn")
+    for _, contract, trial in trials(config, Job(config), [kind]):
         if not contract.startswith("killed"):
             trial()
 
     assert command("new", f"{kind}=my_own", f"to={folder}") == 2
     assert "is not empty" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["model=mynet"], "to: missing; write to=FOLDER, as in to=./mynet"),
+        (["to=x"], "new: name one component"),
+        (["model=mynet", "sampler=mine", "to=x"], "new: name one component"),
+        (["model=MyNet", "to=x"], "model=MyNet: a name has lowercase letters"),
+        (["model=class", "to=x"], "model=class: is a word of Python's own"),
+        (["model=cnn", "to=x"], "model=cnn: is built in and is not replaced"),
+    ],
+)
+def test_a_package_that_cannot_be_is_one_line(
+    words: list[str], reason: str, command: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("new", *words) == 2
+    assert reason in capsys.readouterr().err
+
+
+def test_a_wheel_brings_the_examples_that_packages_are_made_of() -> None:
+    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())
+    brought = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
+    assert (brought["conf"], brought["examples"]) == ("atlantis_exp/conf", "atlantis_exp/examples")
+    assert all((CHECKOUT / "examples" / f"{example}.py").is_file() for example, _ in EXAMPLES.values())
+
+
+def test_what_is_written_is_whole_or_not_there(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="name too long"):  # once the first files are written
+        begin("model", 300 * "x", tmp_path / "new", CONF.parent / "examples")
+    assert [*tmp_path.iterdir()] == []
 
 
 @pytest.mark.slow

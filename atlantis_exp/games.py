@@ -1,13 +1,8 @@
-"""Names and facts that are needed before torch and numpy are there."""
+"""The facts of a game that the package uses; worker processes import this, so it imports nothing heavy."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
-
-C = TypeVar("C", bound=type)
-
-TABLE_COLUMNS = ("mean", "standard_error", "median", "interquartile_mean", "high", "low")
-"""The parts of a score distribution's summary that a line of a table has, in their order."""
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -41,8 +36,3 @@ class Game:
     def is_logarithmic(self) -> bool:
         """Whether scores are shown on a logarithmic axis."""
         return self.score_range[0] > 0
-
-
-def component(name: str, *kinds: str) -> Callable[[C], C]:  # noqa: ARG001 - whoever reads the source reads them there
-    """Name a class as a component of these kinds, all of them plain strings: `@component("mynet", "model")`."""
-    return lambda named: named

@@ -5,7 +5,7 @@ import pytest
 
 _PROBE = """
 import resource
-from atlantis_exp.learning.allocation import keep_freed_memory
+from atlantis_exp.learning.process import keep_freed_memory
 {call}
 size = 64_000_000  # bytes; the default keeps up to 32 MiB
 b"x" * size

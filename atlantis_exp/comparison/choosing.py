@@ -1,0 +1,149 @@
+"""Choose runs by their configs and tags, group them, and refuse groups whose scores do not mean the same."""
+
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, TypeVar
+
+from atlantis_exp.checking import nearest
+from atlantis_exp.comparison.gather import Player, Run, Training
+from atlantis_exp.components import title_of
+from atlantis_exp.faults import ConfigError
+
+R = TypeVar("R", bound=Run)
+
+PROTOCOL = (
+    *("env.id", "env.frameskip", "env.sticky", "env.max_frames", "env.max_steps", "env.noop_max", "env.max_pool"),
+    *("env.crop", "evaluation.epsilon"),
+)
+"""What must be equal for scores to mean the same; the observation's size belongs to the network."""
+
+COMMIT = "git.commit"
+"""The key whose values are commits."""
+_COMMIT_DIGITS = 10
+
+
+def select(runs: Iterable[R], where: Sequence[str]) -> list[R]:
+    """Return the runs for which all of KEY=VALUE hold, with keys as `group` takes them. Raises: ConfigError."""
+    runs = list(runs)
+    for text in where:
+        key, equals, _ = text.partition("=")
+        if not equals:
+            raise ConfigError(f"where={text}: write KEY=VALUE, as in where=model=cnn,seed=0")
+        _check_key("where", key, runs)
+    return [run for run in runs if is_where(run, where)]
+
+
+def is_where(run: Run, where: Sequence[str]) -> bool:
+    """Return whether all of KEY=VALUE hold for a run."""
+    facts = run.facts
+    pairs = (text.split("=", 1) for text in where)
+    return all(_is(facts.get(resolve(key, facts)), value) for key, value in pairs)
+
+
+def group(runs: Iterable[R], by: Sequence[str]) -> dict[str, list[R]]:
+    """Group runs by config keys or tags, `model` being short for `model.name`; in the order of the groups' labels.
+
+    Raises:
+        ConfigError: on a key that no run has.
+    """
+    runs = list(runs)
+    for key in by:
+        _check_key("by", key, runs)
+    groups = defaultdict(list)
+    for run in runs:
+        groups[" ".join(values_in(run.facts, by)) or "all"].append(run)
+    return dict(sorted(groups.items()))
+
+
+def values_in(facts: Mapping[str, Any], by: Sequence[str]) -> tuple[str, ...]:
+    """Return the value of each key as people write it; a commit by its first digits."""
+    values = []
+    for key in by:
+        name = resolve(key, facts)
+        value = facts.get(name)
+        text = value if isinstance(value, str) else f"{name.rsplit('.')[-1] or key}={json.dumps(value)}"
+        values.append(text[:_COMMIT_DIGITS] if name == COMMIT else text)
+    return tuple(values)
+
+
+def resolve(key: str, config: Mapping[str, Any]) -> str:
+    """Return the dotted key that a short one stands for, `model.name` for `model`; empty if there is none."""
+    return next((name for name in (key, f"{key}.name", f"{key}.id") if name in config), "")
+
+
+def shortened(keys: Iterable[str], facts: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return keys in their short forms, each once, in the alphabetical order of the dotted ones."""
+    short = []
+    for key in sorted(keys, key=lambda key: resolve(key, facts)):
+        stem = key.removesuffix(".name").removesuffix(".id")
+        short.append(stem if resolve(stem, facts) == key else key)
+    return tuple(dict.fromkeys(short))
+
+
+def mixed_protocol(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -> tuple[str, str] | None:
+    """Return which part of the protocol differs, `game` or a key, and a sentence about it; None if scores compare.
+
+    Keys of `by` may differ, except the game.
+
+    Args:
+        configs: by the names of runs or contenders, with dotted keys.
+    """
+    games = {name: title_of(config["env.id"]) for name, config in configs.items()}
+    if len(set(games.values())) > 1:
+        return "game", f"env.id differs: scores of different games are not compared: {_holders(games)}"
+    asked = {resolve(key, config) for key in by for config in configs.values()}
+    for key in PROTOCOL:
+        values = {name: json.dumps(config[key]) for name, config in configs.items()}
+        if key not in asked and len(set(values.values())) > 1:
+            return key, f"{key} differs, so the scores do not mean the same: {_holders(values)}"
+    return None
+
+
+def refuse_mixed_protocols(trainings: Sequence[Training], by: Sequence[str]) -> None:
+    """Raise ConfigError if trainings differ in their protocol, other than in keys of `by`."""
+    if (mixed := mixed_protocol({training.name: training.config for training in trainings}, by)) is None:
+        return
+    key, sentence = mixed
+    hints = {
+        "game": "choose with runs= or where=env.id=ID",
+        "evaluation.epsilon": (
+            "at_epsilon=VALUE takes evaluations at that one, `evaluate run=NAME epsilon=VALUE` makes them"
+        ),
+    }
+    raise ConfigError(f"{sentence}; {hints.get(key, f'choose with runs= or where=, or ask for it with by={key}')}")
+
+
+def _holders(values: Mapping[str, str]) -> str:
+    """Say which names have which value."""
+    names = defaultdict(list)
+    for name, value in values.items():
+        names[value].append(name)
+    return "; ".join(
+        f"{value} in {first}{f' and {len(others)} more' if others else ''}"
+        for value, (first, *others) in sorted(names.items())
+    )
+
+
+def plays_alike(player: Player, trainings: Iterable[Training]) -> bool:
+    """Return whether all play the same game; the crop belongs to a network, as epsilon does."""
+    keys = set(PROTOCOL) - {"env.crop"}
+    if "weights" not in player.config:
+        keys -= {"evaluation.epsilon"}
+    return all(player.config.get(key) == training.config[key] for training in trainings for key in keys)
+
+
+def _check_key(option: str, key: str, runs: Sequence[Run]) -> None:
+    if runs and not any(resolve(key, run.facts) for run in runs):
+        raise ConfigError(f"{option}={key}: no such key; {nearest(key, {k for run in runs for k in run.facts})}")
+
+
+def _is(value: Any, text: str) -> bool:
+    """Return whether a text writes a value: as Python or JSON do, a number in any way."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        with suppress(ValueError):
+            return float(text) == value
+    if isinstance(value, list):
+        return "".join(text.split()) in (str(value).replace(" ", ""), json.dumps(value, separators=(",", ":")))
+    return text in (str(value), json.dumps(value))

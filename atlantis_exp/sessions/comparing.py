@@ -1,0 +1,201 @@
+"""Compare finished runs: hold the comparison's folder, take the looks that are due, publish and print the answers."""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from time import strftime
+from typing import Any
+
+from rich.table import Table
+from rich.text import Text
+
+from atlantis_exp import terminal
+from atlantis_exp.checking import digest, flatten
+from atlantis_exp.comparison import tables
+from atlantis_exp.comparison.choosing import (
+    COMMIT,
+    group,
+    is_where,
+    plays_alike,
+    refuse_mixed_protocols,
+    select,
+    shortened,
+)
+from atlantis_exp.comparison.export_tables import to_latex, with_units
+from atlantis_exp.comparison.figures import Drawn, draw
+from atlantis_exp.comparison.gather import Gathered, Player, Training, gather, refuse_unknown
+from atlantis_exp.comparison.looks import read_looks, write_looks
+from atlantis_exp.comparison.page import page, plain
+from atlantis_exp.comparison.tables import Comparison
+from atlantis_exp.comparison.verdict import Question, families, group_of, worse_than_baseline
+from atlantis_exp.comparison.words import spent
+from atlantis_exp.config import TrackingConfig
+from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.media import run_colour
+from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.runs.journal import Journal
+from atlantis_exp.runs.provenance import provenance
+from atlantis_exp.tracking.publishing import how_to_open, publishing
+
+_PAGE = "comparison.html"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which finished runs are compared, by which of their evaluations."""
+
+    outputs: Path
+    runs: Sequence[str] = ()  # names, starts of names, patterns or a decision's name; none: all
+    where: Sequence[str] = ()  # KEY=VALUE
+    at_epsilon: float | None = None  # of the evaluations; None: each run's latest
+
+
+def compare(
+    question: Question, choice: Choice, tracking: TrackingConfig, command: str, *, look_now: bool = False
+) -> Comparison:
+    """Compare finished runs; print the answers, and keep page, figures and tables as a run of their own.
+
+    The same question of more seeds is the same comparison: its folder holds the looks taken so far.
+
+    Raises:
+        ConfigError: if there is nothing to compare, the runs' protocols differ, or no group is the baseline.
+        Fault: if commits are compared with a baseline and another one is worse.
+    """
+    outputs = choice.outputs
+    gathered = _gather(choice, put_aside=COMMIT in question.by)
+    trainings = gathered.trainings
+    refuse_mixed_protocols(trainings, question.by)
+    question = replace(question, by=shortened(question.by, trainings[0].facts))
+    groups = group(trainings, question.by)
+    asked = families([group_of(members, question.by) for members in groups.values()], question)
+    identity = {
+        **asdict(question),
+        "by": list(question.by),
+        "runs": sorted({*choice.runs}),
+        "where": sorted({*choice.where}),
+        "at_epsilon": choice.at_epsilon,
+        "baseline": next((each.plan.baseline for each in asked if each.plan.baseline is not None), None),
+        "groups": [[label, *_recipes(members)] for label, members in groups.items()],
+    }
+    folder = RunFolder(outputs / "comparisons" / f"{_slug(list(groups))}-{digest(identity)}")
+    labels = {
+        "mlflow.runName": folder.name,
+        "mlflow.runColor": run_colour("comparison"),
+        "atlantis.kind": "comparison",
+    }
+    with folder.held():
+        record = read_looks(folder.path, asked)
+        with terminal.working("computing the tables"):
+            comparison = tables.compare(gathered, groups, question, record, look_now)
+        write_looks(folder.path, comparison.answers)
+        with terminal.working("drawing the figures"):
+            figures = draw(comparison)
+        with publishing(folder, tracking, outputs, labels) as journal:
+            folder.write_config(facts := {**identity, "compared": [training.name for training in trainings]})
+            journal.params({key: str(value) for key, value in flatten(facts).items()})
+            _write(journal, comparison, figures, provenance(command), f"{len(trainings)} under {outputs / 'runs'}")
+    _print(comparison)
+    _print_film([*trainings, *(player for player in gathered.players if plays_alike(player, trainings))])
+    print(f"{how_to_open(outputs)}\n{folder.artifact(_PAGE)}")
+    if COMMIT in question.by and (worse := worse_than_baseline(comparison.answers, question.by)):
+        raise Fault(f"worse than the baseline {question.baseline}: {'; '.join(worse)}")
+    return comparison
+
+
+def _gather(choice: Choice, put_aside: bool) -> Gathered:
+    """Read the chosen runs, and say which are left out. Raises: ConfigError, if there are none."""
+    refuse_unknown(choice.outputs, choice.runs)
+    with terminal.working(f"reading the runs under {choice.outputs}"):
+        gathered = gather(choice.outputs, choice.runs, choice.at_epsilon, put_aside)
+    for name, reason in gathered.skipped.items():
+        terminal.warn(f"left out {name}: {reason}")
+    if not (trainings := select(gathered.trainings, choice.where)):
+        found = len(gathered.trainings)
+        none = f": none of {found} has where={','.join(choice.where)}" if found else ""
+        raise ConfigError(f"there is no finished training under {choice.outputs / 'runs'} to compare{none}")
+    lost = [run for run in gathered.lost if is_where(run, choice.where)]
+    return replace(gathered, trainings=trainings, lost=lost)
+
+
+def _recipes(runs: Sequence[Training]) -> list[str]:
+    """Digest what a group's runs are except for their seeds: their science, their length and their evaluation.
+
+    A key that differs between seeds, but not between runs of one seed, may follow from the seed and is left out: with
+    evaluation.seed=${seed} each further seed would otherwise make another comparison, without the looks taken before.
+    """
+    recipes = [run.science | {key: run.config[key] for key in ("budget.steps", "evaluation.epsilon")} for run in runs]
+    seeds = {run.config["seed"] for run in runs}
+
+    def follows(key: str) -> bool:
+        values = {(run.config["seed"], json.dumps(recipe.get(key))) for run, recipe in zip(runs, recipes, strict=True)}
+        return len(values) == len(seeds) > 1 and len({value for _, value in values}) > 1
+
+    left_out = {key for recipe in recipes for key in recipe if follows(key)} | {"seed"}
+    return sorted({digest({key: recipe[key] for key in recipe.keys() - left_out}) for recipe in recipes})
+
+
+def _write(
+    journal: Journal, comparison: Comparison, figures: Mapping[str, Drawn], made: Mapping[str, str], compared: str
+) -> None:
+    """Write the page, its figures and tables, and what MLflow shows."""
+    shown = {
+        "command": made["command"],
+        "made": strftime("%Y-%m-%d %H:%M %Z"),
+        "code": made.get("git.commit", made["version.atlantis-exp"]),
+        "runs": compared,
+    }
+    journal.tags({**made, "verdict": comparison.verdict})
+    journal.note("\n\n".join([comparison.verdict, *comparison.others, *comparison.caveats, *comparison.notes]))
+    journal.metrics(_metrics(comparison), 0)
+    journal.artifact(_PAGE, page(comparison, figures, shown).encode())
+    for name, figure in figures.items():
+        journal.artifact(f"figures/{name}.png", figure.png)
+    for name, table in comparison.tables.items():
+        journal.artifact(f"tables/{name}.csv", tables.to_csv(with_units(name, table)).encode())
+        journal.artifact(f"tables/{name}.tex", to_latex(name, table).encode())
+    journal.finish()
+
+
+def _metrics(comparison: Comparison) -> dict[str, float]:
+    """Return each pair's difference, and whether it is decided, under names in MLflow's alphabet."""
+    metrics: dict[str, Any] = {}
+    for row in comparison.tables["verdict"]:
+        if row["seeds"]:
+            pair = f"difference/{_slug([row['group']])} over {_slug([row['other']])}"
+            metrics |= {pair: row["difference"], f"{pair}/decided": float(row["said"] != "not decided")}
+    return metrics
+
+
+def _print(comparison: Comparison) -> None:
+    console = terminal.console(least=160)
+    for name, title in (("scores", "scores"), ("evaluation", "episodes")):
+        header, *rows = plain(name, comparison.tables[name])
+        table = Table(*header, title=f"{title} after the last step, by {', '.join(comparison.by)}")
+        for column in table.columns[1:]:
+            column.justify = "right"
+        for row in rows:
+            table.add_row(*map(Text, row))
+        console.print(table)
+    for note in comparison.notes:
+        console.print(f"- {note}")
+    console.print()
+    for each in comparison.answers:
+        console.print(f"By {each.family.name}: {spent(each)}.")
+    for sentence in comparison.caveats:
+        console.print(f"- {sentence}")
+    for sentence in (*reversed(comparison.others), comparison.verdict):
+        console.print(f"\n{sentence}")
+
+
+def _print_film(played: Sequence[Training | Player]) -> None:
+    """Say where the highest score can be seen, if it was filmed."""
+    best = max(played, key=lambda each: each.episodes.scores.max())
+    if best.film is not None and best.film.exists():
+        print(f"\nthe highest score, {best.episodes.scores.max():,.0f}, as a film: {best.film}")
+
+
+def _slug(groups: Sequence[str]) -> str:
+    """Make a file's name of groups' labels."""
+    return re.sub(r"[^A-Za-z0-9.]+", "-", "-vs-".join(groups))[:80].strip("-.") or "group"

@@ -1,0 +1,83 @@
+"""The life cycle of a page: the folder of its own in which a sweep, a search or a decision shows how it stands."""
+
+import signal
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+from typing import NoReturn
+
+from atlantis_exp.config import TrackingConfig
+from atlantis_exp.faults import Fault
+from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.runs.journal import Journal, Status
+from atlantis_exp.runs.provenance import provenance
+from atlantis_exp.tracking.publishing import publishing
+
+
+def ending(error: BaseException | None) -> tuple[Status, str]:
+    """Return the last status of a page whose block raised `error`, and the reason.
+
+    What a signal or the end of the time has stopped was killed: the same command continues it.
+    """
+    if error is None:
+        return "FINISHED", ""
+    reason = str(error) or type(error).__name__
+    if isinstance(error, Fault) and error.exit_code == 124:
+        return "KILLED", reason
+    return ("FAILED", reason) if isinstance(error, Exception) else ("KILLED", "")
+
+
+@contextmanager
+def opened(
+    folder: RunFolder,
+    tracking: TrackingConfig,
+    outputs: Path,
+    labels: Mapping[str, str],
+    command: str,
+    *,
+    prepare: Callable[[], None] = lambda: None,
+    others: Sequence[RunFolder] = (),
+    ending: Callable[[BaseException | None], tuple[Status, str]] = ending,
+) -> Iterator[Journal]:
+    """Hold a page's folder and publish its journal, which goes on behind what it says already.
+
+    The page is RUNNING in the block; `ending` gives its status after it.
+
+    labels: tags that the page has from its first moment.
+    command: what continues it.
+    prepare: called once the folder is held, before anything is published.
+    others: runs of other processes that are published too.
+
+    Raises:
+        Fault: another process holds the folder, or its journal is damaged.
+    """
+    with folder.held():
+        prepare()
+        with publishing(folder, tracking, outputs, labels, others) as journal:
+            journal.resume()
+            journal.tags(provenance(command))
+            journal.status("RUNNING")
+            try:
+                yield journal
+                journal.flush()
+            except BaseException as error:
+                with suppress(OSError):  # a full disk takes no status; the next command sees that nobody holds the page
+                    journal.status(*ending(error))
+                raise
+            journal.status(*ending(None))
+
+
+@contextmanager
+def terminable() -> Iterator[None]:
+    """Let SIGTERM end the process as an exception does; a run that is trained in the block listens for itself."""
+
+    def end(number: int, _: FrameType | None) -> NoReturn:
+        sys.exit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
