@@ -31,7 +31,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 MODULES = (
-    *("decision", "comparison.verdict", "learning.objectives", "replay.memory", "runs.journal"),
+    *("comparison.decision", "comparison.verdict", "learning.objectives", "replay.memory", "runs.journal"),
     *("training.checkpoint", "training.trainer", "sessions.sweep"),
 )
 ALSO = {"training.trainer": ("training.checkpoint",), "replay.memory": ("training.checkpoint",)}

@@ -294,7 +294,7 @@ def size_found(verdict: Verdict, look: Look) -> float:
     freedom = 2 * (verdict.seeds - 1)
     limit = -stdtrit(freedom, look.error / len(look.verdicts) / 2)
     error = (verdict.high - verdict.low) / 2 / limit
-    t = abs(verdict.difference) / error
+    t = float(abs(verdict.difference) / error)
 
     def above_half(shift: float) -> float:  # of the differences decided where this is true, the share that is smaller
         below = 1 - nctdtr(freedom, -shift, limit)
