@@ -63,7 +63,7 @@ def process(rng: np.random.Generator, mean: float, growth: float) -> tuple[Train
             rows.append((end * 16 + env, end - time, end - time))
             time = end
     true = mean * np.mean((np.linspace(50_000, 62_500, 100) / 56_250) ** growth)
-    return TrainingEpisodes(*np.array(rows).T), float(true)
+    return TrainingEpisodes(*np.array(rows, np.float64).T), float(true)
 
 
 @pytest.mark.parametrize("mean", [1_300, 3_500, 4_500])
