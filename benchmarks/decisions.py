@@ -405,9 +405,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for (mixture, draws), delta in product(mixtures.items(), (0.5, 1.0, 2.0)):
         if len(draws) == 2:
             drawn = np.stack([draw(rng, (count // 2, SEEDS)) for draw in draws], axis=1)
+            apart = np.array([[delta], [0.0]])
             edges[f"{mixture}, delta {delta:g} sd"] = max(  # the better one may be either
                 float(np.mean([advised(x, Plan(delta=delta))[0].verdicts[0].said == "equivalent" for x in values]))
-                for values in (drawn + [[delta], [0]], drawn - [[delta], [0]])
+                for values in (drawn + apart, drawn - apart)
             )
     print_table(
         "groups of different shapes that are delta apart and found equivalent, in %",
