@@ -63,7 +63,8 @@ def process(rng: np.random.Generator, mean: float, growth: float) -> tuple[Train
             rows.append((end * 16 + env, end - time, end - time))
             time = end
     true = mean * np.mean((np.linspace(50_000, 62_500, 100) / 56_250) ** growth)
-    return TrainingEpisodes(*np.array(rows, np.float64).T), float(true)
+    ends, lengths, scores = (np.array(column, np.float64) for column in zip(*rows, strict=True))
+    return TrainingEpisodes(ends, lengths, scores), float(true)
 
 
 @pytest.mark.parametrize("mean", [1_300, 3_500, 4_500])
@@ -91,7 +92,7 @@ def test_games_that_outlast_the_window_are_refused(folder: str, run: str, steps:
     table = TrainingEpisodes.read(DOCS / folder / "runs" / run / "artifacts" / "episodes.csv")
     with pytest.raises(ValueError, match=rf"episodes ended in the last 20% of {steps:,} steps, and .* needs 30"):
         training_score(table, steps, 16)
-    one_short = TrainingEpisodes(np.arange(FEWEST_EPISODES - 1) + 900.0, np.ones(29), np.ones(29))
+    one_short = TrainingEpisodes(np.linspace(900, 930, FEWEST_EPISODES - 1), np.ones(29), np.ones(29))
     with pytest.raises(ValueError, match="29 episodes"):
         training_score(one_short, 1_000, 1)
 
