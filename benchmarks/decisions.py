@@ -8,9 +8,11 @@ of two groups of one mean, or equivalent of two that are delta apart. Values are
 """
 
 import argparse
+import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from itertools import product
+from itertools import combinations_with_replacement, product
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +20,7 @@ from scipy.special import stdtrit
 from scipy.stats import norm
 
 from atlantis_exp.comparison.decision import Decision, Look, Plan, decide, looks_up_to, mean_interval
+from atlantis_exp.comparison.estimands import TrainingEpisodes, training_score
 from benchmarks.contest import print_results, print_table
 
 Values = npt.NDArray[np.float64]
@@ -27,6 +30,8 @@ SEEDS = 10  # a group
 GROUPS = (2, 4, 8)
 NOISE = 0.1  # within a mode, in distances between the two
 RESAMPLES = 999
+KEPT = Path(__file__).resolve().parents[1] / "docs" / "verdict" / "runs"
+NETWORKS = ("cnn", "resnet_fast")  # of which ten seeds are kept
 
 
 def normal(rng: np.random.Generator, shape: tuple[int, ...]) -> Values:
@@ -51,6 +56,15 @@ def halves(rng: np.random.Generator, shape: tuple[int, ...]) -> Values:
 def steady(rng: np.random.Generator, shape: tuple[int, ...]) -> Values:
     """Seeds that vary by a tenth of the others."""
     return 0.1 * rng.normal(size=shape)
+
+
+def at_the_cap(rng: np.random.Generator, shape: tuple[int, ...]) -> Values:
+    """Nine seeds of ten at the cap to the point, the others low; the mean is 0."""
+    return np.asarray(np.where(rng.random(shape) < 0.9, 1.0, 0.3 * rng.random(shape)) - 0.915) / 0.265
+
+
+def rarely(rng: np.random.Generator, shape: tuple[int, ...]) -> Values:
+    return bimodal(rng, shape, 0.9)
 
 
 SHAPES = {"normal": normal, "log-normal": lognormal, "bimodal 70:30": bimodal, "bimodal 50:50": halves}
@@ -197,6 +211,24 @@ def coverage_of_means(values: Values, rng: np.random.Generator) -> dict[str, flo
     return {name: float(((low <= 0) & (high >= 0)).mean()) for name, (low, high) in intervals.items()}
 
 
+SCORES = ("last evaluation", "training")
+
+
+def kept_seeds(score: str) -> dict[str, Values]:
+    """Return the scores of ten kept seeds of each network: of 100 games of the last weights, or while training."""
+    scores: dict[str, list[float]] = {network: [] for network in NETWORKS}
+    for folder in sorted(KEPT.glob("*-uniform-s*")):
+        config, result = (json.loads((folder / f"{name}.json").read_text()) for name in ("config", "result"))
+        if config["training"]["precision"] == "fp32" and config["model"]["name"] in scores:
+            table = TrainingEpisodes.read(folder / "artifacts" / "episodes.csv")
+            scores[config["model"]["name"]].append(
+                training_score(table, result["steps"], config["env"]["num_envs"])
+                if score == "training"
+                else result["evaluation"]["evaluation/interquartile_mean"]
+            )
+    return {network: np.array(values) for network, values in scores.items()}
+
+
 def percent(share: float) -> str:
     """A share in percent, as the tables print it."""
     return f"{100 * share:.1f}"
@@ -281,14 +313,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
 
     plans = {
+        "5 (`seeds=5`)": Plan(looks=(5,)),
         "5 and 10": plan,
         "10": single,
-        "5, 10 and 20": Plan(looks=looks_up_to(20)),
-        "10 and 20": Plan(looks=(10, 20)),
+        "5, 10 and 20 (`seeds=20`)": Plan(looks=looks_up_to(20)),
     }
     mixtures = {
-        "bimodal 70:30 and steady": (bimodal, steady),
-        "three bimodal 70:30 and steady": (bimodal, bimodal, bimodal, steady),
+        "bimodal 70:30 and steady (a tenth of the spread)": (bimodal, steady),
+        "two bimodal 70:30 and one steady": (bimodal, bimodal, steady),
+        "four bimodal 70:30 and one steady": (*[bimodal] * 4, steady),
+        "seven bimodal 70:30 and one steady": (*[bimodal] * 7, steady),
+        "bimodal 90:10 and steady": (rarely, steady),
+        "nine of ten at the cap and steady": (at_the_cap, steady),
+        "log-normal and steady": (lognormal, steady),
         "log-normal and normal": (lognormal, normal),
         "normal and steady": (normal, steady),
     }
@@ -303,6 +340,44 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "groups of one mean and different shapes that decide anything, in %, by the looks of the plan",
         ("", *plans),
         [(mixture, *map(percent, row.values())) for mixture, row in shapes.items()],
+    )
+
+    worst_groups, worst_plan = max(product(shapes, plans), key=lambda cell: shapes[cell[0]][cell[1]])
+
+    seeds_of = {score: kept_seeds(score) for score in SCORES}
+    real: dict[str, float] = {}
+    needed: dict[str, dict[str, float]] = {score: {} for score in SCORES}
+    long = Plan(looks=looks_up_to(40))
+    for score, kept in seeds_of.items():
+        for networks in combinations_with_replacement(NETWORKS, 2):
+            drawn = np.stack([rng.choice(kept[each] - kept[each].mean(), (count, SEEDS)) for each in networks], axis=1)
+            wrongly = np.mean([false_decision(values, plan, advised) for values in drawn])
+            real[f"{score}, {' and '.join(networks)}"] = float(wrongly)
+        drawn = np.stack([rng.choice(kept[each], (count // 4, 40)) for each in NETWORKS], axis=1)
+        level = np.mean([kept[each].mean() for each in NETWORKS])
+        centred = drawn - np.array([kept[each].mean() for each in NETWORKS])[:, None]
+        for asked, rows in {"as they are": drawn, "10 % apart": centred + np.array([[level / 10], [0]])}.items():
+            shares = [found(values, long) for values in rows]
+            needed[score][asked] = float(np.mean([trained for _, trained in shares]))
+            needed[score][f"{asked}, at ten"] = float(np.mean([found(values[:, :SEEDS], plan)[0] for values in rows]))
+    print_table(
+        "groups drawn from the kept seeds and centred to one mean that decide anything, in %",
+        ("", "false"),
+        [(cell, percent(share)) for cell, share in real.items()],
+    )
+    print_table(
+        "DQNCnn and ResNetFast, drawn from the kept seeds: mean seeds a network until decided, in a plan of 40",
+        ("", "seeds as they are", "found by ten", "seeds 10 % apart", "found by ten"),
+        [
+            (
+                score,
+                f"{row['as they are']:.1f}",
+                percent(row["as they are, at ten"]),
+                f"{row['10 % apart']:.1f}",
+                percent(row["10 % apart, at ten"]),
+            )
+            for score, row in needed.items()
+        ],
     )
 
     equivalent = {}
@@ -324,6 +399,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "two groups found equivalent within delta, and any false verdict on three groups and three delta above, in %",
         ("", "of one mean", "delta apart (false)", "of six groups (false)"),
         [(cell, *map(percent, row.values())) for cell, row in equivalent.items()],
+    )
+
+    edges = {}
+    for (mixture, draws), delta in product(mixtures.items(), (0.5, 1.0, 2.0)):
+        if len(draws) == 2:
+            drawn = np.stack([draw(rng, (count // 2, SEEDS)) for draw in draws], axis=1)
+            apart = np.array([[delta], [0.0]])
+            edges[f"{mixture}, delta {delta:g} sd"] = max(  # the better one may be either
+                float(np.mean([advised(x, Plan(delta=delta))[0].verdicts[0].said == "equivalent" for x in values]))
+                for values in (drawn + apart, drawn - apart)
+            )
+    print_table(
+        "groups of different shapes that are delta apart and found equivalent, in %",
+        ("", "false"),
+        [(cell, percent(share)) for cell, share in edges.items()],
     )
 
     coverage = {
@@ -350,7 +440,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print_results(
         {
             "simulations": count,
-            "worst_false_decision": max(share for users in wrong.values() for share in users.values()),
+            "worst_false_decision": max(
+                max(share for users in wrong.values() for share in users.values()), *real.values()
+            ),
+            "worst_shape": {"groups": worst_groups, "looks": worst_plan, "false": shapes[worst_groups][worst_plan]},
+            "seeds_to_decide_before": needed["last evaluation"],
+            "seeds_to_decide_after": needed["training"],
+            "kept_seeds": real,
             "false_decisions": wrong,
             "watching": watched,
             "power": {cell: [row["power"], row["power_at_ten"]] for cell, row in power.items()},
@@ -358,6 +454,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "before_and_after": after,
             "different_shapes": shapes,
             "equivalent": equivalent,
+            "equivalent_of_different_shapes": edges,
             "coverage": coverage,
             "seconds": round(time.perf_counter() - began),
         }

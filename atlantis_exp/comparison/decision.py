@@ -4,10 +4,11 @@ A comparison has a `Plan`: at which numbers of seeds it looks, and the error tha
 `decide` takes the look that is due and returns the verdicts with the record of looks, which is the input of the next
 call. Each look tests by Welch's t with the error that it may spend (Lan and DeMets 1983; quadratic in the number of
 seeds, Kim and DeMets 1987), divided among the pairs that are open (Holm 1979). Both divisions are Bonferroni's, so they
-hold for any number of looks and for pairs that share a group; not where the scores themselves say when to look.
+hold for any number of looks and for pairs that share a group; not where the scores themselves say when to look, and not
+where groups of one mean differ in shape: `condition` tells how far a verdict is from that.
 """
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal
@@ -15,6 +16,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 from scipy.special import nctdtr, stdtrit
+
+from atlantis_exp.statistics import probability_of_improvement
 
 Values = npt.NDArray[np.float64]
 Pair = tuple[str, str]
@@ -135,8 +138,9 @@ def decide(
     a look at the same n costs nothing and finds nothing, and looks nobody planned leave less for those to come. What is
     decided stays decided.
 
-    Before the last look, where any contender's seeds fall into modes, no group's variance counts for less than the
-    contenders' average: a group all of whose few seeds happen to have survived is not known to be steady.
+    Where any contender's seeds fall into modes, no group's variance counts for less than the contenders' average: a
+    group all of whose few seeds happen to have survived is not known to be steady. Where no seed of a pair differs from
+    its group's, the difference itself stands for their unknown spread.
 
     Args:
         groups: one value a seed, by group and seed.
@@ -249,9 +253,111 @@ def power(plan: Plan, difference: float, spread: float, pairs: int = 1) -> tuple
     freedom = 2 * (looks - 1)
     critical = -stdtrit(freedom, _errors(plan) / pairs / 2)
     noncentrality = abs(difference) / (spread * np.sqrt(2 / looks))
-    found = 1 - nctdtr(freedom, noncentrality, critical) + nctdtr(freedom, noncentrality, -critical)
+    found = 2 - nctdtr(freedom, noncentrality, critical) - nctdtr(freedom, -noncentrality, critical)  # either tail
     by_now = np.maximum.accumulate(found)
     return float(by_now[-1]), float(looks[0] + (np.diff(looks) * (1 - by_now[:-1])).sum())
+
+
+@dataclass(frozen=True)
+class Condition:
+    """How much a verdict leans on its condition, that the seeds of both groups differ in their mean only."""
+
+    spreads: float  # the larger standard deviation over the smaller; inf where the seeds of one group are equal
+    undone_by: float  # share of the better group's seeds that would undo the verdict if they scored the floor
+    unseen: float  # share of such seeds that would still escape a look of this size in one of twenty cases
+
+    @property
+    def is_strained(self) -> bool:
+        """Return whether an unseen collapse could undo the verdict, or one spread is twice the other."""
+        return self.undone_by < self.unseen or self.spreads > 2
+
+
+def condition(verdict: Verdict, look: Look, groups: Mapping[str, Mapping[int, float]]) -> Condition:
+    """Return the condition of a verdict of "better" or "worse".
+
+    The floor is 0, or the lowest seed of the two groups if that is below.
+    """
+    values = [[groups[name][seed] for seed in look.seeds[name]] for name in (verdict.group, verdict.other)]
+    small, large = sorted(float(np.std(row)) for row in values)
+    floor = min(0.0, *map(min, values))
+    best = max(float(np.mean(row)) for row in values) - floor
+    undone_by = abs(verdict.difference) / best if best else 0.0
+    return Condition(large / small if small else np.inf, undone_by, 1 - 0.05 ** (1 / verdict.seeds))
+
+
+def size_found(verdict: Verdict, look: Look) -> float:
+    """Return a decided difference, corrected for that a smaller one would not have been decided.
+
+    As many true differences lie above it as below, among those decided at this look (Zhong and Prentice 2008, by the
+    noncentral t). The plain difference overstates: at five seeds a true one of 1 sd is found as 1.9 sd on average.
+    """
+    freedom = 2 * (verdict.seeds - 1)
+    limit = -stdtrit(freedom, look.error / len(look.verdicts) / 2)
+    error = (verdict.high - verdict.low) / 2 / limit
+    t = float(abs(verdict.difference) / error)
+
+    def above_half(shift: float) -> float:  # of the differences decided where this is true, the share that is smaller
+        below = 1 - nctdtr(freedom, -shift, limit)
+        upto, smaller = nctdtr(freedom, shift, (limit, t))
+        return float((below + smaller - upto) / (below + 1 - upto) - 0.5)
+
+    return float(np.sign(verdict.difference) * error * _falls_to(above_half, 0.0, t + 1))
+
+
+def may_be_best(decision: Decision) -> list[str]:
+    """Return the groups that no other was found better than.
+
+    With at least 1 - the plan's error the best is among them, if each was compared with each.
+    """
+    beaten = {
+        verdict.group if verdict.said == "worse" else verdict.other
+        for verdict in decision.verdicts
+        if verdict.said in ("better", "worse")
+    }
+    return [
+        name for name in _names((verdict.group, verdict.other) for verdict in decision.verdicts) if name not in beaten
+    ]
+
+
+def no_worse(verdict: Verdict, margin: float) -> bool:
+    """Return whether the group is no worse than the other by more than a margin, as far as the interval says so.
+
+    For one pair this is wrong with at most half the plan's error. It takes no further look and spends nothing.
+    """
+    return verdict.low > -margin
+
+
+def seeds_needed(difference: float, spread: float, error: float = 0.05, pairs: int = 1) -> int | None:
+    """Return the seeds a group of the shortest plan that finds a difference with 80 %; None beyond a thousand."""
+    sizes = range(FEWEST_SEEDS, 1_001)
+    return next((n for n in sizes if power(Plan(looks_up_to(n), error), difference, spread, pairs)[0] >= 0.8), None)
+
+
+def improvement(one: npt.ArrayLike, other: npt.ArrayLike) -> tuple[float, float, float]:
+    """Return the probability that a seed of one group beats one of another, with the 95 % interval around it.
+
+    The interval is Newcombe's (2006, method 5), which holds where all seeds of one group are above the other's.
+    Returned are its low end, the probability and its high end.
+    """
+    seeds, others = np.asarray(one, np.float64), np.asarray(other, np.float64)
+    found, half = probability_of_improvement(seeds, others), (seeds.size + others.size) / 2 - 1
+
+    def low(share: float) -> float:
+        def above(true: float) -> float:
+            spread = true * (1 - true) * (1 + half * ((1 - true) / (2 - true) + true / (1 + true)))
+            return float(share - true - 1.96 * np.sqrt(spread / (seeds.size * others.size)))
+
+        return _falls_to(above, 0.0, share)
+
+    return low(found), found, 1 - low(1 - found)
+
+
+def _falls_to(zero: Callable[[float], float], low: float, high: float) -> float:
+    """Return where a falling function is zero, by halving."""
+    for _ in range(50):
+        middle = (low + high) / 2
+        low, high = (middle, high) if zero(middle) > 0 else (low, middle)
+    return (low + high) / 2
 
 
 def _errors(plan: Plan) -> Values:
@@ -291,11 +397,11 @@ def _look(
     places = {name: place for place, name in enumerate(seeds)}
     one, other = np.array([[places[name] for name in pair] for pair in pairs]).T
     means, variances = values.mean(axis=1), values.var(axis=1, ddof=1)
-    is_last = size == plan.looks[-1]
-    if not is_last and any(modes(row) for row in values):
+    if any(modes(row) for row in values):
         variances = np.maximum(variances, variances.mean())
     differences = means[one] - means[other]
     spreads = np.sqrt((variances[one] + variances[other]) / 2)
+    spreads = np.where(spreads > 0, spreads, np.abs(differences))
     with np.errstate(invalid="ignore"):  # 0 / 0 where neither group varies
         share = np.nan_to_num(variances[one] / (variances[one] + variances[other]), nan=0.5)
     freedom = (size - 1) / (share**2 + (1 - share) ** 2)  # Welch and Satterthwaite
@@ -324,7 +430,7 @@ def _look(
             low=float(low[row]),
             high=float(high[row]),
             seeds=size,
-            detectable=float(reach[row]) if is_last and undecided[row] else None,
+            detectable=float(reach[row]) if size == plan.looks[-1] and undecided[row] else None,
         )
         for row, pair in enumerate(pairs)
     ]

@@ -8,7 +8,7 @@ from math import isclose, nan
 from statistics import fmean
 
 from atlantis_exp.comparison.choosing import COMMIT, resolve, values_in
-from atlantis_exp.comparison.decision import equal_scores, modes
+from atlantis_exp.comparison.decision import condition, equal_scores, modes, size_found
 from atlantis_exp.comparison.gather import AXES, StoredRun, Training
 from atlantis_exp.comparison.published import Table, early_dqn, random_line
 from atlantis_exp.comparison.verdict import Answer, group_of
@@ -38,6 +38,24 @@ class Facts:
 
 
 Note = Callable[[Facts], Iterator[str]]
+
+
+def conditions(facts: Facts) -> Iterator[str]:
+    """Say how much each verdict leans on its condition, and how much its difference is overstated."""
+    for answer in facts.answers:
+        taken = [(look, verdict) for look in answer.decision.looks for verdict in look.verdicts]
+        for look, verdict in taken:
+            pair = (verdict.group, verdict.other) if verdict.said == "better" else (verdict.other, verdict.group)
+            there = all(set(look.seeds[name]) <= answer.family.seeds[name].keys() for name in pair)
+            if verdict.said in ("better", "worse") and there:
+                found = condition(verdict, look, answer.family.seeds)
+                yield (
+                    f"{pair[0]} against {pair[1]}: looks find large differences first; the true one is rather "
+                    f"{abs(size_found(verdict, look)):,.0f} points. The error holds for groups whose seeds are spread "
+                    f"alike: here by {found.spreads:.1f} times as much in one as in the other, and if "
+                    f"{found.undone_by:.0%} of the seeds of {pair[0]} collapsed, it would be no better; "
+                    f"{verdict.seeds} seeds without a collapse leave up to {found.unseen:.0%} possible."
+                )
 
 
 def collapsed(facts: Facts) -> Iterator[str]:
@@ -280,7 +298,7 @@ def random_player(facts: Facts) -> Iterator[str]:
 
 
 CAVEATS: Sequence[Note] = (
-    *(collapsed, lost_seeds, equal, modes_found, unlike, lossy, uncommitted),
+    *(conditions, collapsed, lost_seeds, equal, modes_found, unlike, lossy, uncommitted),
     *(unbalanced, later_seeds, moved_seeds),
 )
 """What may make a verdict mean something else."""

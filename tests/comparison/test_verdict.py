@@ -756,3 +756,12 @@ def test_a_question_that_makes_no_sense_is_refused_in_one_line(
 ) -> None:
     recorded()
     assert run(word, code=2).startswith(f"atlantis_exp: {line}")
+
+
+def test_a_verdict_says_its_condition_and_its_size_where_a_look_found_it() -> None:
+    found = compared(around("a", 1_000, range(10)) + around("b", 950, range(10)))
+    (line,) = (note for note in found.caveats if "collapsed" in note)
+    assert line.startswith("a against b: ")
+    assert "if 5% of the seeds of a collapsed, it would be no better" in line
+    assert re.search(r"1\.0 times as much .* leave up to (26|45)% possible", line)
+    assert not [note for note in compared(around("a", 1_000) + around("b", 1_000)).caveats if "collapsed" in note]

@@ -1,0 +1,103 @@
+"""Training scores against naive code, on kept tables, and where a process has a known mean."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from atlantis_exp.comparison.estimands import FEWEST_EPISODES, TrainingEpisodes, training_score
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+KEPT = sorted((DOCS / "verdict" / "runs").glob("*-uniform-s*"))
+
+
+def naive(episodes: TrainingEpisodes, steps: int, num_envs: int, window: float) -> float:
+    """Return the same, step by step: each step of each episode has an equal part of its score."""
+    points, known, ended = 0.0, 0, 0
+    for end, length, score in zip(episodes.ends, episodes.lengths, episodes.scores, strict=True):
+        if end > steps * (1 - window):
+            ended += 1
+            for back in range(int(length)):
+                if end - back * num_envs > steps * (1 - window):
+                    points += score / length
+                    known += 1
+    return points / known * steps * window / ended
+
+
+@pytest.mark.parametrize("run", KEPT[:6], ids=lambda run: run.name)
+def test_it_is_what_a_walk_through_every_step_finds(run: Path) -> None:
+    episodes = TrainingEpisodes.read(run / "artifacts" / "episodes.csv")
+    for window in (0.2, 0.5):
+        expected = naive(episodes, 1_000_000, 16, window)
+        assert training_score(episodes, 1_000_000, 16, window) == pytest.approx(expected, rel=1e-3)
+
+
+def test_episodes_that_fill_the_window_have_their_mean() -> None:
+    ends = np.repeat(np.arange(1, 101) * 40.0, 4)  # four environments, ten steps each
+    scores = np.tile([1.0, 2.0, 3.0, 6.0], 100)
+    table = TrainingEpisodes(ends, np.full(400, 10.0), scores)
+    assert training_score(table, 4_000, 4) == pytest.approx(3)
+    assert training_score(table, 4_000, 4, window=0.95) == pytest.approx(3)
+
+
+def test_what_an_episode_earned_before_the_window_does_not_count() -> None:
+    ends, lengths = np.array([900.0, *np.arange(901, 931)]), np.array([150.0, *np.full(30, 1.0)])
+    table = TrainingEpisodes(ends, lengths, np.array([300.0, *np.full(30, 2.0)]))  # two points a step, always
+    assert training_score(table, 1_000, 1) == pytest.approx(2 * 200 / 31)
+
+
+def process(rng: np.random.Generator, mean: float, growth: float) -> tuple[TrainingEpisodes, float]:
+    """Return 16 environments of 62,500 steps, a point a step, whose mean length grows; and its mean in the window."""
+    rows = []
+    for env in range(16):
+        time = 0.0
+        while True:
+            life = rng.gamma(4) / 4 * mean  # consumed at the speed of the network there is: integral of (t / T)^-growth
+            if growth:
+                at = (time / 56_250 + 1e-3) ** (1 - growth) + (1 - growth) * life / 56_250
+                end = (at ** (1 / (1 - growth)) - 1e-3) * 56_250
+            else:
+                end = time + life
+            if end > 62_500:
+                break
+            rows.append((end * 16 + env, end - time, end - time))
+            time = end
+    true = mean * np.mean((np.linspace(50_000, 62_500, 100) / 56_250) ** growth)
+    ends, lengths, scores = (np.array(column, np.float64) for column in zip(*rows, strict=True))
+    return TrainingEpisodes(ends, lengths, scores), float(true)
+
+
+@pytest.mark.parametrize("mean", [1_300, 3_500, 4_500])
+@pytest.mark.parametrize("growth", [0.0, 0.7])
+def test_it_is_unbiased_where_the_mean_of_the_ended_episodes_lags(mean: float, growth: float) -> None:
+    rng, found, ended = np.random.default_rng(0), [], []
+    for _ in range(60):
+        table, true = process(rng, mean, growth)
+        found.append(training_score(table, 1_000_000, 16) / true - 1)
+        ended.append(table.scores[table.ends > 800_000].mean() / true - 1)
+    assert abs(np.mean(found)) < 0.03
+    if growth and mean > 3_000:
+        assert np.mean(ended) < np.mean(found) - 0.015
+
+
+@pytest.mark.parametrize(
+    ("folder", "run", "steps"),
+    [
+        ("rewards", "cnn-uniform-s2-5b86150e39", 1_250_000),  # 5 ended: mean 198,920, its evaluation 860,422
+        ("standard", "cnn-uniform-s2-58c6ca5154", 1_250_000),  # 9
+        ("longer", "cnn-uniform-s0-20892e8da8", 1_000_000),  # 16, all at once at the cap
+    ],
+)
+def test_games_that_outlast_the_window_are_refused(folder: str, run: str, steps: int) -> None:
+    table = TrainingEpisodes.read(DOCS / folder / "runs" / run / "artifacts" / "episodes.csv")
+    with pytest.raises(ValueError, match=rf"episodes ended in the last 20% of {steps:,} steps, and .* needs 30"):
+        training_score(table, steps, 16)
+    one_short = TrainingEpisodes(np.linspace(900, 930, FEWEST_EPISODES - 1), np.ones(29), np.ones(29))
+    with pytest.raises(ValueError, match="29 episodes"):
+        training_score(one_short, 1_000, 1)
+
+
+def test_a_table_that_is_none_is_named(tmp_path: Path) -> None:
+    (tmp_path / "episodes.csv").write_text("episode,step,length\n1,2,3\n")
+    with pytest.raises(ValueError, match=r"episodes\.csv is no table of a training's episodes"):
+        TrainingEpisodes.read(tmp_path / "episodes.csv")
