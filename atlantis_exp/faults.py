@@ -1,5 +1,7 @@
 """What a person can act on: mistakes and faults that end a command with one line instead of a traceback."""
 
+from errno import EACCES, EDQUOT, ENOSPC, EPERM, EROFS
+
 
 class Fault(RuntimeError):
     """Ends a command with one clear line and an exit code; nothing committed is lost."""
@@ -18,3 +20,14 @@ class ConfigError(Fault, ValueError):
 
     def __init__(self, message: str) -> None:
         super().__init__(message, exit_code=2)
+
+
+def in_words(error: OSError) -> str:
+    """Return what a file or folder lacks, and what a person can do about it."""
+    place = f"{error.filename}: " if error.filename else ""
+    remedy = ""
+    if error.errno in (ENOSPC, EDQUOT):
+        remedy = "; make room, or name a folder elsewhere with paths.outputs=FOLDER"
+    elif error.errno in (EACCES, EPERM, EROFS):
+        remedy = "; allow it, or name another folder with paths.outputs=FOLDER"
+    return f"{place}{error.strerror or error}{remedy}"

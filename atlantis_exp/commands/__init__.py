@@ -53,6 +53,9 @@ def main() -> None:
 
 
 def _run() -> None:
+    from atlantis_exp import terminal
+
+    terminal.guard()
     first, *rest = sys.argv[1:] or [""]
     if first in VERBS:
         verb, arguments = first, rest
@@ -64,7 +67,6 @@ def _run() -> None:
     else:
         verb, arguments = "train", sys.argv[1:]
     if {"--help", "-h"} & {*arguments}:
-        from atlantis_exp import terminal
         from atlantis_exp.commands.helping import help_text, overview
 
         text = help_text(verb, arguments) if first in VERBS or len(arguments) > 1 else overview()

@@ -56,9 +56,19 @@ def checked(schema: type[T], composed: DictConfig) -> T:
     if isinstance(training, dict) and isinstance(training.get("weights"), str):
         training["weights"] = pinned(training["weights"])
     paths = tree.get("paths")
-    if isinstance(paths, dict) and isinstance(paths.get("outputs"), str) and paths["outputs"]:
-        paths["outputs"] = str(absolute("paths.outputs", paths["outputs"]))
+    if isinstance(paths, dict) and isinstance(text := paths.get("outputs"), str):
+        paths["outputs"] = str(_folder("paths.outputs", text)) if text.strip() else ""
     return parse(schema, tree)
+
+
+def _folder(key: str, text: str) -> Path:
+    """Return a path that is a folder or may become one. Raises: ConfigError."""
+    folder = absolute(key, text)
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    if not there.is_dir() or folder == Path(folder.anchor):
+        what = "the root of all files" if there.is_dir() else f"{there} is not a folder"
+        raise ConfigError(f"{key}={text}: {what}; name a folder of its own, as in {key}=./outputs")
+    return folder
 
 
 def pinned(weights: str) -> str:

@@ -14,7 +14,7 @@ from atlantis_exp import terminal
 from atlantis_exp.build import build_trained_network, build_trainer, choose_device, described, import_components
 from atlantis_exp.checking import flatten, to_dict
 from atlantis_exp.config import Config
-from atlantis_exp.faults import ConfigError, Fault, RunFault
+from atlantis_exp.faults import ConfigError, Fault, RunFault, in_words
 from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import CONFIG, LOST, TRACEBACK, Result, RunFolder, all_runs
 from atlantis_exp.runs.journal import Journal, adopt, has_lost_commit
@@ -70,8 +70,7 @@ def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int |
         result = _close(trainer, folder, journal, outcome)
     steps = f"{trainer.counters.steps:,}"
     if outcome != "interrupted":
-        told = terminal.harmless(result.report)
-        print(f"\n{told}\n\nrun {folder.name}: {steps} steps, {trainer.counters.seconds:,.0f} s")
+        print(f"\n{result.report}\n\nrun {folder.name}: {steps} steps, {trainer.counters.seconds:,.0f} s")
     elif stop():
         stop.end(f"run {folder.name} is committed at step {steps}; continue with: {job.command}")
     return stop.signal
@@ -108,7 +107,7 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
             )
         return False
     how = f"{result.outcome} after {result.steps:,} steps"
-    print(terminal.harmless(f"run {folder.name} has ended ({how}):\n\n{result.report}"))
+    print(f"run {folder.name} has ended ({how}):\n\n{result.report}")
     return True
 
 
@@ -221,7 +220,8 @@ def _faults_recorded(job: Job, folder: RunFolder, journal: Journal) -> Iterator[
             write_file(folder.path / TRACEBACK, traceback.format_exc().encode())
             journal.status("FAILED", str(error) or type(error).__name__)
         if isinstance(error, RunFault | OSError):
-            raise Fault(f"run {folder.name}: {error}; continue with: {job.command}") from error
+            reason = in_words(error) if isinstance(error, OSError) else error
+            raise Fault(f"run {folder.name}: {reason}; continue with: {job.command}") from error
         if job.config.compile and _is_of_compilation(error):
             reason = str(error).strip().partition("\n")[0]
             raise Fault(f"run {folder.name}: torch.compile failed, {reason}; compile=false does without") from error

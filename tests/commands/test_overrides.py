@@ -112,6 +112,11 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("env.frameskip=often", "env.frameskip", "valid integer or be a valid array"),
     ("tracking.experiment=../x", "tracking.experiment", "pattern"),
     ("paths.outputs=", "paths.outputs", "at least 1"),
+    ("paths.outputs='\t'", "paths.outputs", "at least 1"),
+    ("paths.outputs=/dev/null", "paths.outputs=/dev/null: /dev/null is not a folder", "as in paths.outputs=./outputs"),
+    ("paths.outputs=/dev/null/x", "/dev/null is not a folder", "as in paths.outputs=./outputs"),
+    ("paths.outputs=/", "paths.outputs=/: the root", "as in paths.outputs=./outputs"),
+    ("budget.wall_clock=abc", "budget.wall_clock=abc: not a duration", "use 90s, 10min or 3h"),
     ("paths.outputs=null", "paths.outputs", "valid string"),
     # one key against another
     ("training.batch_size=2_000_000", "training.batch_size=2000000", "at most 1000000"),

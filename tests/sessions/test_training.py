@@ -508,7 +508,7 @@ def test_a_commit_that_the_disk_refuses_is_one_clear_line_and_costs_nothing_comm
 
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", full)
-        with pytest.raises(Fault, match="No space left on device; continue with: "):
+        with pytest.raises(Fault, match=r"No space left on device; make room, or name .*; continue with: "):
             train(Job(config))
     folder = RunFolder.of(config)
     assert folder.state == "interrupted"

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from atlantis_exp import terminal
-from atlantis_exp.faults import Fault
+from atlantis_exp.faults import Fault, in_words
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.launchers import Launcher
 
@@ -33,7 +33,7 @@ class _Training:
         try:
             self.train(overrides)
         except (Fault, OSError) as error:
-            return error if isinstance(error, Fault) else Fault(str(error))
+            return error if isinstance(error, Fault) else Fault(in_words(error))
         except Exception as error:
             traceback.print_exc()
             return Fault(f"{' '.join(overrides)}: {type(error).__name__}: {error}")
