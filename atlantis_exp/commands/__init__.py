@@ -36,6 +36,11 @@ CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else CHECKOUT / "conf"
 """The config groups, those of a checkout or those that an installed package brings."""
 
 
+def default_outputs() -> Path:
+    """Return the outputs folder: a checkout's wherever one stands; an installed package has no place of its own."""
+    return (CHECKOUT if CONF.parent == CHECKOUT else Path.cwd()) / "outputs"
+
+
 def main() -> None:
     """Run the verb that the command line names first; only its own module is imported."""
     interrupts.listen()
@@ -57,6 +62,17 @@ def _run() -> None:
 
     terminal.guard()
     first, *rest = sys.argv[1:] or [""]
+    if first in ("--complete", "--completion"):
+        from atlantis_exp.commands.completing import SCRIPTS, candidates
+
+        if first == "--complete":
+            print(*candidates(rest), sep="\n")
+        elif rest and rest[0] in SCRIPTS:
+            print(SCRIPTS[rest[0]], end="")
+        else:
+            print(f"atlantis_exp: --completion: name a shell, one of {', '.join(SCRIPTS)}", file=sys.stderr)
+            sys.exit(2)
+        return
     if first in VERBS:
         verb, arguments = first, rest
     elif first and "=" not in first and first[0] not in "-~+":

@@ -16,7 +16,7 @@ from yaml import YAMLError
 
 from atlantis_exp import components
 from atlantis_exp.checking import absolute, nearest, parse
-from atlantis_exp.commands import CHECKOUT, CONF
+from atlantis_exp.commands import CONF, default_outputs
 from atlantis_exp.config import PINNED, record_plugins
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.files import ARTIFACT, read_file
@@ -27,12 +27,7 @@ _LIKE = {"model": "cnn", "objective": "dqn", "env": "atlantis_standard"}
 """Of each kind whose components have keys besides their settings, ours with these alone; of games the protocol."""
 
 
-def _outputs_folder() -> str:
-    # A checkout keeps its runs whatever the current folder is; an installed package has no place of its own.
-    return str((CHECKOUT if CONF.parent == CHECKOUT else Path.cwd()) / "outputs")
-
-
-OmegaConf.register_new_resolver("outputs_folder", _outputs_folder, replace=True)
+OmegaConf.register_new_resolver("outputs_folder", lambda: str(default_outputs()), replace=True)
 
 
 def _head_for(objective: str, other: str = "plain") -> str:

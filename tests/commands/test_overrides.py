@@ -1,6 +1,7 @@
 """What a person may write on a command line, and what they are told when they may not."""
 
 import re
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -244,7 +245,12 @@ def test_a_plugin_of_an_unknown_user_is_one_line_before_hydra_reads_it() -> None
     [
         ("seed=range(0)", "seed=range(0): there is no value in it"),
         ("optimizer.lr=interval(0,1)", "optimizer.lr=interval(0,1): no list of values; write them out"),
-        ("model=glob(*)", "model=glob(*): no list of values; write them out"),
+        (
+            "model=glob(*)",
+            "model=glob(*): write the options out, as in model=cnn,cnn_small,resnet,resnet_fast",
+        ),
+        ("model=glob(resnet*)", "model=glob(resnet*): write the options out, as in model=resnet,resnet_fast"),
+        ("seed=glob(*)", "seed=glob(*): no list of values; write them out"),
         ("seed=range(0,1,0)", "seed=range(0,1,0): range() arg 3 must not be zero"),
         ("seed=range(0,1000000000)", "seed=range(0,1000000000): more than 10,000 values"),
         ("seed=shuffle(range(0,1000000000))", "seed=shuffle(range(0,1000000000)): more than 10,000 values"),
@@ -289,3 +295,30 @@ def test_a_key_given_twice_is_refused(line: str) -> None:
 @pytest.mark.thinned(4)
 def test_what_is_right_passes(line: str) -> None:
     check("config", Config, re.findall(r"(?:[^ ']|'[^']*')+", line))
+
+
+def test_a_sweep_kept_in_a_file_is_the_one_typed_out(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(
+        "model: [cnn, resnet]\noptimizer: {lr: [1e-3, 0.0001]}\nseed: range(0,2)\nenv.crop: [[0, 160, 210, 0]]\n"
+        "budget.steps: 100\nthreads: null\n"
+    )
+    texts = ["model=cnn,resnet", "optimizer.lr=1e-3,0.0001", "seed=range(0,2)", "env.crop=[0, 160, 210, 0]"]
+    found = located(["-m", f"sweep={tmp_path / 'mine.yaml'}", "threads=1"])
+    assert found == ["-m", *texts, "budget.steps=100", "threads=null", "threads=1"]
+    assert len(check("config", Config, found[:-1])) == 8
+
+
+@pytest.mark.parametrize("text", ["", "a", "- 1", "a: [", "a: !!python/name:os.system", None])
+def test_a_file_that_is_no_sweep_is_one_line(tmp_path: Path, text: str | None) -> None:
+    if text is not None:
+        (tmp_path / "mine.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=r"^sweep=.*mine\.yaml: should be a file with KEY: VALUE .*$"):
+        located([f"sweep={tmp_path / 'mine.yaml'}"])
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["objective=quantile,double_quantile objective.quantiles=11", "lr_schedule=linear,one_cycle lr_schedule.end=0.1"],
+)
+def test_a_key_that_all_swept_options_have_and_the_default_one_lacks_is_taken(line: str) -> None:
+    assert len(check("config", Config, ["-m", *line.split()])) == 2
