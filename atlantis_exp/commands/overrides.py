@@ -136,6 +136,8 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
     for override in overrides:
         if override.is_sweep_override() and not flags.multirun:
             raise ConfigError(f"{override.input_line}: several values are a sweep; add -m")
+        if override.is_delete() and not _key(override).startswith(("phase.", "hydra")):
+            raise ConfigError(f"{override.input_line}: needed; write {_key(override)}=VALUE")
     launcher(arguments)
     overrides = [override for override in overrides if not _is_hydras(override)]
     admit(next((override.value() for override in overrides if override.key_or_group == "plugins"), []))
@@ -287,7 +289,8 @@ def values_of(override: Override) -> list[str]:
     try:
         values = [*override.sweep_string_iterator()]
     except ValueError as error:  # a range in steps of 0
-        raise ConfigError(f"{override.input_line}: {error}") from None
+        reason = str(error).partition("\n")[0]
+        raise ConfigError(f"{override.input_line}: {reason}") from None
     except HydraException:
         text = override.input_line
         if isinstance(listed, Glob) and (names := listed.filter(options_of(override.key_or_group))):
@@ -327,9 +330,6 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
     overrides = {text: read_override(text) for text in texts}
     groups = _groups(config_name)
     chosen = tuple(text for text, override in overrides.items() if _key(override) in groups)
-    for text, override in overrides.items():
-        if override.is_delete() and not _key(override).startswith("phase."):
-            raise ConfigError(f"{text}: needed; write {text[1:].partition('=')[0]}=VALUE")
     for text in chosen:
         override = overrides[text]
         folder, value = override.key_or_group, override.value()
