@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any, NoReturn, get_args
 
@@ -21,7 +21,7 @@ from atlantis_exp.runs.folder import TRACEBACK, RunFolder, State
 from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, adopt, curve, fitted
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.job import Job
-from atlantis_exp.sessions.launchers import BASIC, Launcher, slurm
+from atlantis_exp.sessions.launchers import BASIC, Launcher
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.tracking.publishing import catch_up, publishing
 
@@ -121,18 +121,16 @@ def _page(
 
 @contextmanager
 def _launched(launcher: Launcher, jobs: Sequence[Job], folders: Sequence[RunFolder]) -> Iterator[None]:
-    """Show the jobs of a launcher while it runs them, in the context that it needs."""
+    """Show the jobs of a launcher while it runs them."""
     if launcher.is_basic:
         yield
         return
-    context: AbstractContextManager[None] = slurm.all_awaited() if launcher.name == "slurm" else nullcontext()
     table = LiveTable(jobs, folders)
-    with context:
-        try:
-            with _every(table.seconds, table.look):
-                yield
-        finally:
-            table.close()
+    try:
+        with _every(table.seconds, table.look):
+            yield
+    finally:
+        table.close()
 
 
 @contextmanager
