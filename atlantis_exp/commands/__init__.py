@@ -45,52 +45,43 @@ def main() -> None:
     """Run the verb that the command line names first; only its own module is imported."""
     interrupts.listen()
     try:
-        _run()
-    except Exception:
-        if not interrupts.seen():
+        verb, arguments = _split(sys.argv[1:])
+        importlib.import_module(f"atlantis_exp.commands.{verb.replace('-', '_')}").VERB.run(arguments)
+    except (Exception, KeyboardInterrupt) as error:
+        if isinstance(error, Exception) and not interrupts.seen():
             raise
-    except KeyboardInterrupt:  # before there is anything to lose, or a verb would have said so
-        pass
-    else:
-        return
-    print("atlantis_exp: interrupted", file=sys.stderr)
-    sys.exit(130)  # 128 + SIGINT
+        print("atlantis_exp: interrupted", file=sys.stderr)  # before there is anything to lose, or a verb had said so
+        sys.exit(130)  # 128 + SIGINT
 
 
-def _run() -> None:
+def _split(words: list[str]) -> tuple[str, list[str]]:
+    """Return the verb of a command line and its arguments; ends the process where something is only to be printed."""
     from atlantis_exp import terminal
 
     terminal.guard()
-    first, *rest = sys.argv[1:] or [""]
-    if first in ("--complete", "--completion"):
-        from atlantis_exp.commands.completing import SCRIPTS, candidates
-
-        if first == "--complete":
-            print(*candidates(rest), sep="\n")
-        elif rest and rest[0] in SCRIPTS:
-            print(SCRIPTS[rest[0]], end="")
-        else:
-            print(f"atlantis_exp: --completion: name a shell, one of {', '.join(SCRIPTS)}", file=sys.stderr)
-            sys.exit(2)
-        return
+    first, *rest = words or [""]
     if first in VERBS:
         verb, arguments = first, rest
     elif first and "=" not in first and first[0] not in "-~+":
         from atlantis_exp.checking import nearest
 
-        print(f"atlantis_exp: {first}: no such verb; {nearest(first, VERBS)}", file=sys.stderr)
+        terminal.warn(f"{first}: no such verb; {nearest(first, VERBS)}")
         sys.exit(2)
     else:
-        verb, arguments = "train", sys.argv[1:]
-    if {"--help", "-h"} & {*arguments}:
+        verb, arguments = "train", words
+    if first in ("--complete", "--completion"):
+        from atlantis_exp.commands.completing import complete
+
+        text = complete(first, rest)
+    elif {"--help", "-h"} & {*arguments}:
         from atlantis_exp.commands.helping import help_text, overview
 
         text = help_text(verb, arguments) if first in VERBS or len(arguments) > 1 else overview()
-        terminal.console().print(text)  # survives a closed pipe
-        sys.exit(0)
-    if "--version" in arguments:
+    elif "--version" in arguments:
         from importlib.metadata import version
 
-        print(f"atlantis-exp {version('atlantis-exp')}")
-        sys.exit(0)
-    importlib.import_module(f"atlantis_exp.commands.{verb.replace('-', '_')}").VERB.run(arguments)
+        text = f"atlantis-exp {version('atlantis-exp')}"
+    else:
+        return verb, arguments
+    terminal.console().print(text)  # survives a closed pipe
+    sys.exit(0)

@@ -18,21 +18,24 @@ _atlantis_exp() {
     [[ $word == *=* ]] && COMPREPLY=("${COMPREPLY[@]#"${word%%=*}="}")  # bash takes the rest for a word of its own
     compopt -o nospace
 }
-complete -F _atlantis_exp atlantis-exp
-""",
+complete -F _atlantis_exp atlantis-exp""",
     "zsh": """\
 _atlantis_exp() {
     local -a found
     found=(${(f)"$(atlantis-exp --complete "${(@)words[2,CURRENT]}")"})
     compadd -S '' -- $found
 }
-compdef _atlantis_exp atlantis-exp
-""",
-    "fish": """\
-complete -c atlantis-exp -f -a '(atlantis-exp --complete (commandline -opc)[2..] (commandline -ct))'
-""",
+compdef _atlantis_exp atlantis-exp""",
+    "fish": "complete -c atlantis-exp -f -a '(atlantis-exp --complete (commandline -opc)[2..] (commandline -ct))'",
 }
 """What a shell evaluates, as in `eval "$(atlantis-exp --completion bash)"`."""
+
+
+def complete(flag: str, words: Sequence[str]) -> str:
+    """Return what `--complete WORDS` prints, or the script of `--completion SHELL`."""
+    if flag == "--complete":
+        return "\n".join(candidates(words))
+    return SCRIPTS.get("".join(words), f"echo 'atlantis_exp: --completion: one of {', '.join(SCRIPTS)}' >&2")
 
 
 def candidates(words: Sequence[str]) -> list[str]:
