@@ -15,7 +15,6 @@ from safetensors import SafetensorError
 from torch import nn
 
 from atlantis_exp import config as cfg
-from atlantis_exp.checking import to_dict
 from atlantis_exp.components import Component, admitted, describe, facts_of, points_of
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.game.emulator import Emulator, check_game
@@ -202,14 +201,10 @@ def _architecture(config: cfg.Config) -> nn.Module:
 
 
 def build_optimizer(optimizer: cfg.AdamConfig | cfg.RmsPropConfig, network: nn.Module) -> torch.optim.Optimizer:
-    """The optimizer of all of a network's parameters."""
-    settings = to_dict(optimizer)
+    """Return the optimizer of all of a network's parameters."""
+    settings = dataclasses.asdict(optimizer)
     name = settings.pop("name")
-    if isinstance(optimizer, cfg.AdamConfig):
-        settings["betas"] = optimizer.betas
-        settings["fused"] = True
-    else:
-        settings["foreach"] = True
+    settings["fused" if isinstance(optimizer, cfg.AdamConfig) else "foreach"] = True
     return OPTIMIZERS[name](network.parameters(), **settings)
 
 

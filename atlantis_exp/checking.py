@@ -41,17 +41,21 @@ def check_time(key: str, text: str | int | None, example: str) -> None:
     if text is None:
         return
     if not (length := seconds(text)):
-        raise ConfigError(f"{key}={text}: no time; write it as in {example}")
+        raise ConfigError(f"{key}={text}: not a duration; use {example}")
     if length > _LONGEST:
         raise ConfigError(f"{key}={text}: should be at most 10 years")
 
 
 def absolute(key: str, text: str) -> Path:
-    """A path that a person typed, `~` filled in. Raises: ConfigError."""
+    """Return the path that a person typed, `~` filled in. Raises: ConfigError."""
     try:
-        return Path(text).expanduser().absolute()
+        path = Path(text).expanduser().absolute()
+        str(path).encode()
     except RuntimeError:
         raise ConfigError(f"{key}={text}: there is no such user here, whose folder ~ would be") from None
+    except UnicodeEncodeError:
+        raise ConfigError(f"{key}={text}: is in a folder whose name is not UTF-8; name another folder") from None
+    return path
 
 
 def check_new(key: str, folder: Path) -> None:

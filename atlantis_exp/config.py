@@ -388,7 +388,7 @@ class BudgetConfig:
     forecast: Literal["refuse", "warn", "off"]
 
     def __post_init__(self) -> None:
-        check_time("budget.wall_clock", self.wall_clock, "90s, 10min, 3h or 1h30m")
+        check_time("budget.wall_clock", self.wall_clock, "90s, 10min or 3h")
 
     @property
     def seconds(self) -> int | None:

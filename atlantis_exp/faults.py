@@ -1,6 +1,6 @@
 """Mistakes and faults that end a command with one line, which a person can act on, instead of a traceback."""
 
-import errno
+from errno import EACCES, EDQUOT, EFBIG, ENOSPC, EPERM, EROFS
 
 
 class Fault(RuntimeError):
@@ -22,8 +22,12 @@ class ConfigError(Fault, ValueError):
         super().__init__(message, exit_code=2)
 
 
-def remedied(error: Exception) -> str:
-    """Return an error's message, of a full disk with the key and the remedy."""
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return f"paths.outputs: {error}; make room there, or name another disk"
-    return str(error)
+def in_words(error: OSError) -> str:
+    """Return what a file or folder lacks, and what a person can do about it."""
+    place = f"{error.filename}: " if error.filename else ""
+    remedy = ""
+    if error.errno in (ENOSPC, EDQUOT, EFBIG):
+        remedy = "; make room, or name a folder elsewhere with paths.outputs=FOLDER"
+    elif error.errno in (EACCES, EPERM, EROFS):
+        remedy = "; allow it, or name another folder with paths.outputs=FOLDER"
+    return f"{place}{error.strerror or error}{remedy}"

@@ -6,10 +6,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from io import TextIOWrapper
 from itertools import count
 from pathlib import Path
+from typing import Any, TextIO
 
 from rich.console import Console
+from rich.text import Text
 
 _HERE = Path(__file__).parent
 PROGRAM = "atlantis-exp" if (_HERE / "conf").is_dir() else "python -m atlantis_exp"
@@ -18,21 +21,54 @@ LINE_SECONDS = 4.0  # before the first line of what is under way: nothing begins
 _FIRST_SECONDS = 1.0  # what takes less needs no line
 
 
+class _Harmless:
+    """A stream that leaves out what a terminal would obey, whatever is printed to it."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+
+    def write(self, text: str) -> int:
+        return self.stream.write(harmless(text))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+
+class _Console(Console):
+    """A console that shows texts as they are, and sends codes of its own alone."""
+
+    def __init__(self, **settings: Any) -> None:
+        file = sys.stdout.stream if isinstance(sys.stdout, _Harmless) else sys.stdout
+        super().__init__(file=file, highlight=False, markup=False, emoji=False, **settings)
+
+    def render_str(self, text: str, **settings: Any) -> Text:
+        return super().render_str(harmless(text), **settings)
+
+
+def guard() -> None:
+    """Have stdout and stderr leave out what a terminal would obey, and write in any encoding."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if not isinstance(stream, _Harmless):
+            if isinstance(stream, TextIOWrapper):
+                stream.reconfigure(errors="backslashreplace")
+            setattr(sys, name, _Harmless(stream))
+
+
 def console(least: int | None = None) -> Console:
-    """A console; least: columns of a table that would be cut on a narrower one, None to leave long lines to it."""
+    """Return a console; least: columns of a table that would be cut on a narrower one, None to keep lines whole."""
     if least is None:
-        return Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
-    width = max(shutil.get_terminal_size().columns, least)
-    return Console(highlight=False, markup=False, emoji=False, width=width)
+        return _Console(soft_wrap=True)
+    return _Console(width=max(shutil.get_terminal_size().columns, least))
 
 
 def harmless(text: str) -> str:
-    """A stored text without what a terminal would obey: its lines of printable characters."""
+    """Return a text without what a terminal would obey: its lines of printable characters."""
     return "".join(character for character in text if character == "\n" or character.isprintable())
 
 
 def warn(text: str) -> None:
-    """Print one line on stderr, without what a terminal would obey."""
+    """Print one line on stderr."""
     print(f"atlantis_exp: {harmless(text)}".replace("\n", " "), file=sys.stderr, flush=True)
 
 
@@ -50,7 +86,7 @@ def working(what: str, how_far: Callable[[], str] = str) -> Iterator[None]:
     shown, began, ended = console(), time.monotonic(), threading.Event()
 
     def line() -> str:
-        return ", ".join(filter(None, (what, how_far(), f"{time.monotonic() - began:.0f} s")))
+        return harmless(", ".join(filter(None, (what, how_far(), f"{time.monotonic() - began:.0f} s"))))
 
     def tell() -> None:
         if ended.wait(_FIRST_SECONDS):

@@ -233,8 +233,8 @@ def killed_of(module: str, sample: int, seed: int, folder: Path) -> dict[str, An
     mutants = [each for each in mutants_of(tree) if f"{module}: {each.change}" not in equivalent]
     chosen = random.Random(seed).sample(mutants, min(sample, len(mutants)))
     by_cost = sorted(watch.seconds, key=watch.seconds.__getitem__)
-    waiting: list[Mutant | None] = sorted(chosen, key=lambda each: -each.line)
-    waiting.append(None)  # first of all the original
+    latest_first = sorted(chosen, key=lambda each: -each.line)
+    waiting: list[Mutant | None] = [*latest_first, None]  # first of all the original
     running: dict[int, tuple[Mutant | None, float, Path]] = {}
     survivors: list[str] = []
     while waiting or running:

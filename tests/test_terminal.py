@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
+from rich.table import Table
 
 from atlantis_exp import terminal
 
@@ -20,6 +21,32 @@ def test_a_stored_text_keeps_its_lines_and_loses_what_a_terminal_obeys() -> None
 def test_a_warning_is_one_line_whatever_is_in_it(capsys: pytest.CaptureFixture[str]) -> None:
     terminal.warn("left out a\nb: \x1b[2J\udcff ±")
     assert capsys.readouterr() == ("", "atlantis_exp: left out a b: [2J ±\n")
+
+
+def test_whatever_is_printed_a_terminal_obeys_nothing_of_it(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.MonkeyPatch.context() as patched:
+        for name in ("stdout", "stderr"):
+            patched.setattr(sys, name, getattr(sys, name))  # which is put back
+        terminal.guard()
+        print("run \x1b[2J\u202e\udcff±")
+        print("a\x9b2J", file=sys.stderr)
+        table = Table("\x1b]0;x\x07name")
+        table.add_row("\x1b[31mred\u202e")
+        terminal.console().print(table)
+        terminal.console().print("line \x1b[2J")
+    printed = capsys.readouterr()
+    assert not [each for each in printed.out + printed.err if each != "\n" and not each.isprintable()]
+    assert printed.out.startswith("run [2J±\n")
+    assert "[31mred" in printed.out
+
+
+def test_a_console_colours_with_codes_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = io.StringIO()
+    monkeypatch.setattr(sys, "stdout", screen)
+    terminal.guard()
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    terminal.console().print("name", style="bold")
+    assert "\x1b[" in screen.getvalue()
 
 
 @pytest.fixture

@@ -36,45 +36,52 @@ CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else CHECKOUT / "conf"
 """The config groups, those of a checkout or those that an installed package brings."""
 
 
+def default_outputs() -> Path:
+    """Return the outputs folder: a checkout's wherever one stands; an installed package has no place of its own."""
+    return (CHECKOUT if CONF.parent == CHECKOUT else Path.cwd()) / "outputs"
+
+
 def main() -> None:
     """Run the verb that the command line names first; only its own module is imported."""
     interrupts.listen()
     try:
-        verb, arguments = _asked()
+        verb, arguments = _split(sys.argv[1:])
         importlib.import_module(f"atlantis_exp.commands.{verb.replace('-', '_')}").VERB.run(arguments)
-    except Exception:
-        if not interrupts.seen():
+    except (Exception, KeyboardInterrupt) as error:
+        if isinstance(error, Exception) and not interrupts.seen():
             raise
-    except KeyboardInterrupt:  # before there is anything to lose, or a verb would have said so
-        pass
-    else:
-        return
-    print("atlantis_exp: interrupted", file=sys.stderr)
-    sys.exit(130)  # 128 + SIGINT
+        print("atlantis_exp: interrupted", file=sys.stderr)  # before there is anything to lose, or a verb had said so
+        sys.exit(130)  # 128 + SIGINT
 
 
-def _asked() -> tuple[str, list[str]]:
-    """Return the verb and its arguments; print help or the version instead, where that is asked for."""
-    first, *rest = sys.argv[1:] or [""]
+def _split(words: list[str]) -> tuple[str, list[str]]:
+    """Return the verb of a command line and its arguments; ends the process where something is only to be printed."""
+    from atlantis_exp import terminal
+
+    terminal.guard()
+    first, *rest = words or [""]
     if first in VERBS:
         verb, arguments = first, rest
     elif first and "=" not in first and first[0] not in "-~+":
         from atlantis_exp.checking import nearest
 
-        print(f"atlantis_exp: {first}: no such verb; {nearest(first, VERBS)}", file=sys.stderr)
+        terminal.warn(f"{first}: no such verb; {nearest(first, VERBS)}")
         sys.exit(2)
     else:
-        verb, arguments = "train", sys.argv[1:]
-    if {"--help", "-h"} & {*arguments}:
-        from atlantis_exp import terminal
+        verb, arguments = "train", words
+    if first in ("--complete", "--completion"):
+        from atlantis_exp.commands.completing import complete
+
+        text = complete(first, rest)
+    elif {"--help", "-h"} & {*arguments}:
         from atlantis_exp.commands.helping import help_text, overview
 
         text = help_text(verb, arguments) if first in VERBS or len(arguments) > 1 else overview()
-        terminal.console().print(text)  # survives a closed pipe
-        sys.exit(0)
-    if "--version" in arguments:
+    elif "--version" in arguments:
         from importlib.metadata import version
 
-        print(f"atlantis-exp {version('atlantis-exp')}")
-        sys.exit(0)
-    return verb, arguments
+        text = f"atlantis-exp {version('atlantis-exp')}"
+    else:
+        return verb, arguments
+    terminal.console().print(text)  # survives a closed pipe
+    sys.exit(0)

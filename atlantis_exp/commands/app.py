@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 from atlantis_exp import interrupts, terminal
 from atlantis_exp.commands.composing import admit
 from atlantis_exp.commands.overrides import check, flags_of, launcher, located, refuse_twice, shown
-from atlantis_exp.faults import ConfigError, Fault, remedied
+from atlantis_exp.faults import ConfigError, Fault, in_words
 from atlantis_exp.machine import Machine, here
 from atlantis_exp.sessions.job import command_line
 from atlantis_exp.sessions.launchers import Launcher
@@ -71,9 +71,12 @@ class Verb(Generic[T]):
                 raise ConfigError(f"hydra/launcher: runs trainings; {self.name} does one after the other, leave it out")
             else:
                 in_turn(self.work, asked)
-        except (Fault, OSError) as error:
-            terminal.warn(remedied(error))
-            sys.exit(getattr(error, "exit_code", 1))
+        except Fault as error:
+            terminal.warn(str(error))
+            sys.exit(error.exit_code)
+        except OSError as error:
+            terminal.warn(in_words(error))
+            sys.exit(1)
 
     def asked(self, arguments: Sequence[str], typed: Sequence[str] = ()) -> list[Asked[T]]:
         """Check every job that arguments ask for. Raises: ConfigError."""

@@ -60,14 +60,8 @@ def _work(asked: Asked[BaselineConfig]) -> Callable[[], None]:
     from atlantis_exp.sessions.evaluating import play_baseline
 
     config = asked.config
-    return partial(
-        play_baseline,
-        **vars(config),
-        name=config.run_name(),
-        title=config.title(),
-        command=asked.command,
-        cores=asked.machine.cores,
-    )
+    work = partial(play_baseline, **vars(config), command=asked.command, cores=asked.machine.cores)
+    return partial(work, name=config.run_name(), title=config.title())
 
 
 VERB = Verb("baseline", BaselineConfig, _work)

@@ -16,7 +16,7 @@ from yaml import YAMLError
 
 from atlantis_exp import components
 from atlantis_exp.checking import absolute, nearest, parse
-from atlantis_exp.commands import CHECKOUT, CONF
+from atlantis_exp.commands import CONF, default_outputs
 from atlantis_exp.config import PINNED, record_plugins
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.files import ARTIFACT, read_file
@@ -27,12 +27,7 @@ _LIKE = {"model": "cnn", "objective": "dqn", "env": "atlantis_standard"}
 """Of each kind whose components have keys besides their settings, ours with these alone; of games the protocol."""
 
 
-def _outputs_folder() -> str:
-    # A checkout keeps its runs whatever the current folder is; an installed package has no place of its own.
-    return str((CHECKOUT if CONF.parent == CHECKOUT else Path.cwd()) / "outputs")
-
-
-OmegaConf.register_new_resolver("outputs_folder", _outputs_folder, replace=True)
+OmegaConf.register_new_resolver("outputs_folder", lambda: str(default_outputs()), replace=True)
 
 
 def _head_for(objective: str, other: str = "plain") -> str:
@@ -56,9 +51,19 @@ def checked(schema: type[T], composed: DictConfig) -> T:
     if isinstance(training, dict) and isinstance(training.get("weights"), str):
         training["weights"] = pinned(training["weights"])
     paths = tree.get("paths")
-    if isinstance(paths, dict) and isinstance(paths.get("outputs"), str) and paths["outputs"]:
-        paths["outputs"] = str(absolute("paths.outputs", paths["outputs"]))
+    if isinstance(paths, dict) and isinstance(text := paths.get("outputs"), str):
+        paths["outputs"] = str(_folder("paths.outputs", text)) if text.strip() else ""
     return parse(schema, tree)
+
+
+def _folder(key: str, text: str) -> Path:
+    """Return a path that is a folder or may become one. Raises: ConfigError."""
+    folder = absolute(key, text)
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    if not there.is_dir() or folder == Path(folder.anchor):
+        what = "the root of all files" if there.is_dir() else f"{there} is not a folder"
+        raise ConfigError(f"{key}={text}: {what}; name a folder of its own, as in {key}=./outputs")
+    return folder
 
 
 def pinned(weights: str) -> str:

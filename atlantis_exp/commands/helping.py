@@ -27,7 +27,9 @@ def overview() -> str:
     lines = [f"  {name:15}{purpose}" for name, purpose in VERBS.items()]
     lines.insert(DAILY, "\nmore:")
     parts = [f"{PROGRAM} [VERB] KEY=VALUE ...", "\n".join(lines), *_plugins()]
-    return "\n\n".join([*parts, "No verb means train. VERB --help lists its keys."])
+    return "\n\n".join(
+        [*parts, "No verb means train. VERB --help lists its keys; --completion bash, zsh or fish prints a script."]
+    )
 
 
 def help_text(verb: str, arguments: Sequence[str]) -> str:
@@ -52,11 +54,23 @@ def help_text(verb: str, arguments: Sequence[str]) -> str:
     return "\n\n".join([*parts, *_plugins(), f"Flags:\n{'' if verb in ('decide', 'search') else _SWEEP}{_FLAGS}"])
 
 
+def key_names(verb: str, arguments: Sequence[str]) -> list[str]:
+    """Return the groups of a verb, then every key of the options that the arguments choose."""
+    path = CONF / f"{'config' if verb == 'train' else verb}.yaml"
+    lines = help_text(verb, [*arguments, "all"]).partition("\nFlags:")[0].splitlines()
+    return [*dict(_groups(path)), *(match[1] for line in lines if (match := _SHOWN.match(line)))]
+
+
+def options_of(group: str) -> list[str]:
+    """Return the options of a group, none where it is not one."""
+    folder = group.partition("@")[0]
+    return sorted(path.stem for path in (CONF / folder).glob("*.yaml")) if folder.isidentifier() else []
+
+
 def _of_group(name: str, option: str) -> Iterator[str]:
     """Yield a group with its options, then the keys of one of them."""
     folder, _, package = name.partition("@")
-    options = sorted(path.stem for path in (CONF / folder).glob("*.yaml"))
-    yield f"{name}={option}   ({', '.join(options)})"
+    yield f"{name}={option}   ({', '.join(options_of(name))})"
     path = CONF / folder / f"{option}.yaml"
     if not package and path.is_file():
         yield from _keys(path, "" if "@package _global_" in path.read_text("utf-8") else f"{folder}.")

@@ -2,6 +2,7 @@
 
 import argparse
 import itertools
+import json
 import math
 import re
 import shutil
@@ -13,17 +14,19 @@ from typing import NoReturn, TypeVar
 
 from hydra import compose
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
+from hydra.core.override_parser.types import Glob, IntervalSweep, Override, RangeSweep
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
-from yaml import YAMLError
+from yaml import YAMLError, safe_load
 
 from atlantis_exp.checking import absolute, flatten, nearest
 from atlantis_exp.commands import CONF
 from atlantis_exp.commands.composing import admit, checked, composing
+from atlantis_exp.commands.helping import options_of
 from atlantis_exp.components import KINDS, admitted, installed
 from atlantis_exp.faults import ConfigError
+from atlantis_exp.runs.files import SMALL, read_file
 from atlantis_exp.sessions.job import quoted
 from atlantis_exp.sessions.launchers import BASIC, Launcher
 
@@ -68,19 +71,39 @@ def read_flags(arguments: Sequence[str]) -> tuple[list[str], bool]:
 
 
 def located(arguments: Sequence[str]) -> list[str]:
-    """Return arguments that mean the same in any folder: `--config-dir` and plugins as absolute paths, flags first.
+    """Return arguments that mean the same in any folder: flags first, `--config-dir` and plugins as absolute paths.
+
+    In the place of `sweep=FILE` come the file's overrides.
 
     Raises:
-        ConfigError: for a flag that there is none of.
+        ConfigError: for an unknown flag, and for such a file that cannot be read.
     """
     flags = flags_of(arguments)
+    texts = itertools.chain.from_iterable(
+        _from_file(text[6:]) if text.startswith("sweep=") else [text] for text in flags.overrides
+    )
     return [
         *([f"--config-dir={flags.config_dir}"] if flags.config_dir else []),
         *(["-m"] if flags.multirun else []),
         *(["--cfg", flags.cfg] if flags.cfg else []),
         *(["--resolve"] if flags.resolve else []),
-        *(re.sub(r"^plugins=(.+)$", _located, text, flags=re.DOTALL) for text in flags.overrides),
+        *(re.sub(r"^plugins=(.+)$", _located, text, flags=re.DOTALL) for text in texts),
     ]
+
+
+def _from_file(name: str) -> Iterator[str]:
+    """Yield the overrides in a YAML file: of each key a value, a list of values, or Hydra's words for them."""
+    try:
+        tree = safe_load(read_file(absolute("sweep", name), SMALL))
+        leaves = flatten(tree)
+    except (OSError, ValueError, AttributeError, RecursionError, YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(
+            f"sweep={name}: should be a file with KEY: VALUE or KEY: [VALUES] a line ({reason})"
+        ) from None
+    for key, value in leaves.items():
+        values = value if isinstance(value, list) else [value]
+        yield f"{key}={','.join(each if isinstance(each, str) else json.dumps(each) for each in values)}"
 
 
 def _located(match: re.Match[str]) -> str:
@@ -113,6 +136,8 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
     for override in overrides:
         if override.is_sweep_override() and not flags.multirun:
             raise ConfigError(f"{override.input_line}: several values are a sweep; add -m")
+        if override.is_delete() and not _key(override).startswith(("phase.", "hydra")):
+            raise ConfigError(f"{override.input_line}: needed; write {_key(override)}=VALUE")
     launcher(arguments)
     overrides = [override for override in overrides if not _is_hydras(override)]
     admit(next((override.value() for override in overrides if override.key_or_group == "plugins"), []))
@@ -130,7 +155,12 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
         raise ConfigError(" ".join(re.split("Config search path|full_key:", f"{error}{reason}")[0].split())) from None
     except ConfigError:
         raise
-    except (YAMLError, ValueError, TypeError, RecursionError) as error:  # of a file that Hydra and OmegaConf trusted
+    except (
+        YAMLError,
+        ValueError,
+        TypeError,
+        RecursionError,
+    ) as error:  # of a file that Hydra and OmegaConf trusted
         if own is None:
             raise
         reason = " ".join(str(error).split())
@@ -259,11 +289,15 @@ def values_of(override: Override) -> list[str]:
     try:
         values = [*override.sweep_string_iterator()]
     except ValueError as error:  # a range in steps of 0
-        raise ConfigError(f"{override.input_line}: {error}") from None
+        reason = str(error).partition("\n")[0]
+        raise ConfigError(f"{override.input_line}: {reason}") from None
     except HydraException:
-        raise ConfigError(
-            f"{override.input_line}: no list of values; write them out, or let `search` draw them"
-        ) from None
+        text = override.input_line
+        if isinstance(listed, Glob) and (names := listed.filter(options_of(override.key_or_group))):
+            raise ConfigError(
+                f"{text}: write the options out, as in {override.key_or_group}={','.join(names)}"
+            ) from None
+        raise ConfigError(f"{text}: no list of values; write them out, or let `search` draw them") from None
     if not values:
         raise ConfigError(f"{override.input_line}: there is no value in it")
     return values
@@ -296,9 +330,6 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
     overrides = {text: read_override(text) for text in texts}
     groups = _groups(config_name)
     chosen = tuple(text for text, override in overrides.items() if _key(override) in groups)
-    for text, override in overrides.items():
-        if override.is_delete() and not _key(override).startswith("phase."):
-            raise ConfigError(f"{text}: needed; write {text[1:].partition('=')[0]}=VALUE")
     for text in chosen:
         override = overrides[text]
         folder, value = override.key_or_group, override.value()

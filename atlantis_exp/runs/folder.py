@@ -1,6 +1,7 @@
 """Run folders: where a run lives, what its files are called, who holds it, and how it ended."""
 
 import json
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -74,8 +75,8 @@ class RunFolder:
 
     @property
     def name(self) -> str:
-        """The run's name."""
-        return self.path.name
+        """The run's name, in UTF-8 whatever its folder's bytes are."""
+        return os.fsencode(self.path.name).decode(errors="replace")
 
     @property
     def checkpoints(self) -> Path:

@@ -5,7 +5,7 @@ import io
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, get_args
@@ -16,7 +16,7 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import TABLE_COLUMNS, TRACEBACK, RunFolder, State
 from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, adopt
 from atlantis_exp.sessions.job import Job, fitted
-from atlantis_exp.sessions.launchers import BASIC, Launcher, slurm
+from atlantis_exp.sessions.launchers import BASIC, Launcher
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.page import ending, opened, terminable
 from atlantis_exp.tracking.publishing import catch_up
@@ -111,12 +111,11 @@ def _page(runs: Runs, swept: Sequence[str], launcher: Launcher, command: str) ->
 
 @contextmanager
 def _launched(launcher: Launcher, runs: Runs) -> Iterator[None]:
-    """Show the jobs of a launcher while it runs them, in the context that it needs."""
+    """Show the jobs of a launcher while it runs them."""
     if launcher.is_basic:
         yield
         return
-    context: AbstractContextManager[None] = slurm.all_awaited() if launcher.name == "slurm" else nullcontext()
-    with context, closing(LiveTable([*runs.values()], [*runs])) as table, _every(table.seconds, table.look):
+    with closing(LiveTable([*runs.values()], [*runs])) as table, _every(table.seconds, table.look):
         yield
 
 

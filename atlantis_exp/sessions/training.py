@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -14,13 +15,13 @@ from atlantis_exp import terminal
 from atlantis_exp.build import build_trained_network, build_trainer, choose_device, described, import_components
 from atlantis_exp.checking import flatten, to_dict
 from atlantis_exp.config import Config
-from atlantis_exp.faults import ConfigError, Fault, RunFault, remedied
+from atlantis_exp.faults import ConfigError, Fault, RunFault, in_words
 from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import CONFIG, LOST, TRACEBACK, Result, RunFolder, all_runs
 from atlantis_exp.runs.journal import Journal, adopt, has_lost_commit
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.cards import read_card
-from atlantis_exp.sessions.job import Job, labels
+from atlantis_exp.sessions.job import Job, command_line, labels, replaced
 from atlantis_exp.sessions.processor import processor_name, set_up_torch
 from atlantis_exp.sessions.stopping import StopRequest, sweep_goes_on
 from atlantis_exp.tracking.publishing import catch_up, publishing
@@ -29,6 +30,8 @@ from atlantis_exp.training.forecast import Forecast, forecast
 from atlantis_exp.training.plan import Counters
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Outcome, Trainer
+
+_FIXED = ("constant", "linear_steps")  # schedules that depend on no training's length
 
 
 def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int | None:
@@ -70,8 +73,7 @@ def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int |
         result = _close(trainer, folder, journal, outcome)
     steps = f"{trainer.counters.steps:,}"
     if outcome != "interrupted":
-        told = terminal.harmless(result.report)
-        print(f"\n{told}\n\nrun {folder.name}: {steps} steps, {trainer.counters.seconds:,.0f} s")
+        print(f"\n{result.report}\n\nrun {folder.name}: {steps} steps, {trainer.counters.seconds:,.0f} s")
     elif stop():
         stop.end(f"run {folder.name} is committed at step {steps}; continue with: {job.command}")
     return stop.signal
@@ -108,7 +110,9 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
             )
         return False
     how = f"{result.outcome} after {result.steps:,} steps"
-    print(terminal.harmless(f"run {folder.name} has ended ({how}):\n\n{result.report}"))
+    print(f"run {folder.name} has ended ({how}):\n\n{result.report}")
+    if result.outcome == "finished" and (config.budget.steps or 0) > result.steps:
+        print(f"\nbudget.steps={config.budget.steps} adds nothing to a plan that is over. {_begin_with(job, folder)}")
     return True
 
 
@@ -145,7 +149,7 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
     if state is None:
         if (weights := _initial_weights(config)) is not None:
             trainer.learner.begin_with(weights)
-        progress.say(f"starting run {folder.name} in {folder.path}{_changed_plugins(config, folder)}")
+        progress.say(f"starting run {folder.name} in {folder.path}{_kin(job, folder)}")
     else:
         progress.say(f"continuing run {folder.name} at step {done.steps:,}")
     if config.budget.forecast != "off":
@@ -172,19 +176,37 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
     journal.status("RUNNING")
 
 
-def _changed_plugins(config: Config, folder: RunFolder) -> str:
-    """Which run this one would be, had its plugins not changed since; empty where there is none."""
-    if not config.plugins:
-        return ""
-    science = {**config.science(), "plugins": None}
+def _kin(job: Job, folder: RunFolder) -> str:
+    """Say which run this one would be but for its plugins, or but for a shorter plan; empty where there is none."""
+    config, science = job.config, job.config.science()
     alike = folder.name.rpartition("-")[0]
     for other in all_runs(folder.path.parents[1]):
         if other.name.startswith(f"{alike}-") and other.name != folder.name:
             with suppress(Fault):
                 trained = other.trained_config
-                if {**trained.science(), "plugins": None} == science:
+                theirs = trained.science()
+                if config.plugins and {**theirs, "plugins": None} == {**science, "plugins": None}:
                     return f"; {described(trained)} of run {other.name} has become {described(config)}: another run"
+                if _any_length(theirs) == _any_length(science) and other.result is not None:
+                    parts = {"epsilon": config.epsilon, "lr_schedule": config.lr_schedule}
+                    follow = [f"{kind}={each.name}" for kind, each in parts.items() if each.name not in _FIXED]
+                    why = f" ({' and '.join(follow)} follow the length)" if follow else ""
+                    told = f"run {other.name}, of {other.result.steps:,} steps, is of another plan{why}"
+                    return f"; {told}: this one begins at step 0.\n{_begin_with(job, other)}"
     return ""
+
+
+def _any_length(science: Mapping[str, Any]) -> dict[str, Any]:
+    return {**science, "phase": [{**phase, "steps": None, "episodes": None} for phase in science["phase"]]}
+
+
+def _begin_with(job: Job, folder: RunFolder) -> str:
+    """Say by which commands a training begins with a run's weights."""
+    weights = f"pretrained/{folder.name}"
+    own = [text for text in job.overrides if not text.startswith("budget.steps=")]
+    export = command_line("export", f"run={folder.name}", f"to={weights}", f"paths.outputs={job.outputs}")
+    begin = command_line(*replaced(own, f"training.weights={weights}"))
+    return f"To begin a training with its weights:\n  {export}\n  {begin}"
 
 
 def expected(trainer: Trainer, config: Config, done: Counters) -> Forecast:
@@ -219,7 +241,8 @@ def _faults_recorded(job: Job, folder: RunFolder, journal: Journal) -> Iterator[
             write_file(folder.path / TRACEBACK, traceback.format_exc().encode())
             journal.status("FAILED", str(error) or type(error).__name__)
         if isinstance(error, RunFault | OSError):
-            raise Fault(f"run {folder.name}: {remedied(error)}; continue with: {job.command}") from error
+            reason = in_words(error) if isinstance(error, OSError) else error
+            raise Fault(f"run {folder.name}: {reason}; continue with: {job.command}") from error
         if job.config.compile and _is_of_compilation(error):
             reason = str(error).strip().partition("\n")[0]
             raise Fault(f"run {folder.name}: torch.compile failed, {reason}; compile=false does without") from error

@@ -88,6 +88,16 @@ def test_help_says_what_a_verb_does_and_without_one_which_there_are(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_sweep_runs_the_configs_that_were_checked(
+    command: Command, tiny_overrides: tuple[str, ...], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The default objective has no quantiles, so that no config of the sweep as a whole could be composed."""
+    short = ("phase.quick.steps=20", "evaluation.at_end=false", "evaluation.every_steps=null")
+    words = replaced(tiny_overrides, *short, f"paths.outputs={tmp_path}")
+    assert command("-m", *words, "objective=quantile,double_quantile", "objective.quantiles=11") == 0
+    assert capfd.readouterr().out.splitlines()[-1] == "sweep of 2 runs: 2 done"
+
+
 def test_help_that_nobody_reads_to_its_end_is_no_error() -> None:
     reader, writer = os.pipe()
     os.close(reader)  # as `| head` does

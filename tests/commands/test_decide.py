@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from atlantis_exp.commands import decide, search
 from atlantis_exp.commands.decide import VERB
 from atlantis_exp.faults import ConfigError
 
@@ -87,3 +88,31 @@ def test_help_says_what_decide_takes(command: Command, capsys: pytest.CaptureFix
     shown = capsys.readouterr().out
     for word in ("model", "baseline", "delta", "seeds", "error"):
         assert word in shown
+
+
+@pytest.mark.parametrize(
+    ("words", "first"),
+    [
+        (("objective=quantile,double_quantile", "objective.quantiles=11"), "objective=quantile"),
+        (("lr_schedule=linear,one_cycle", "lr_schedule.end=0.1"), "lr_schedule=linear"),
+    ],
+)
+def test_contenders_may_share_a_key_that_the_default_option_lacks(words: tuple[str, ...], first: str) -> None:
+    (asked,) = decide.VERB.asked(decide.VERB.rewrite([*words]), words)
+    one, other = decide.contest_of(asked).contenders.values()
+    assert one[0] == (first,)
+    assert other[1].overrides[0] == words[1]
+
+
+def test_a_search_may_set_a_key_that_all_searched_options_have() -> None:
+    pytest.importorskip("optuna", reason="needs pip install 'atlantis-exp[search]'")
+    words = [
+        "objective=quantile,double_quantile",
+        "objective.quantiles=11",
+        "optimizer.lr=interval(1e-4,1e-3)",
+        "trials=2",
+    ]
+    (asked,) = search.VERB.asked(search.VERB.rewrite(list(words)), words)
+    found = search.search_of(asked)
+    assert {*found.space} == {"objective", "optimizer.lr"}
+    assert found.overrides == ["objective.quantiles=11", "seed=1000"]

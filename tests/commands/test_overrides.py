@@ -1,6 +1,7 @@
 """What a person may write on a command line, and what they are told when they may not."""
 
 import re
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -57,6 +58,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("~optimizer.lr", "~optimizer.lr", "needed"),
     ("~optimizer", "~optimizer", "needed; write optimizer=VALUE"),
     ("~env.size", "~env.size", "needed"),
+    ("~plugins=0.5", "~plugins=0.5", "needed"),
     ("~phase.single", "phase", "at least one phase"),
     ("phase=two_phase ~phase.first.lr", "phase.first.lr", "missing"),
     ("optimizer.lr=${optimizer.l}", "optimizer.l", "'optimizer.lr'"),
@@ -121,6 +123,11 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("env.frameskip=often", "env.frameskip", "valid integer or be a valid array"),
     ("tracking.experiment=../x", "tracking.experiment", "pattern"),
     ("paths.outputs=", "paths.outputs", "at least 1"),
+    ("paths.outputs='\t'", "paths.outputs", "at least 1"),
+    ("paths.outputs=/dev/null", "paths.outputs=/dev/null: /dev/null is not a folder", "as in paths.outputs=./outputs"),
+    ("paths.outputs=/dev/null/x", "/dev/null is not a folder", "as in paths.outputs=./outputs"),
+    ("paths.outputs=/", "paths.outputs=/: the root", "as in paths.outputs=./outputs"),
+    ("budget.wall_clock=abc", "budget.wall_clock=abc: not a duration", "use 90s, 10min or 3h"),
     ("paths.outputs=null", "paths.outputs", "valid string"),
     # one key against another
     ("training.batch_size=2_000_000", "training.batch_size=2000000", "at most 1000000"),
@@ -247,7 +254,13 @@ def test_a_plugin_of_an_unknown_user_is_one_line_before_hydra_reads_it() -> None
     [
         ("seed=range(0)", "seed=range(0): there is no value in it"),
         ("optimizer.lr=interval(0,1)", "optimizer.lr=interval(0,1): no list of values; write them out"),
-        ("model=glob(*)", "model=glob(*): no list of values; write them out"),
+        (
+            "model=glob(*)",
+            "model=glob(*): write the options out, as in model=cnn,cnn_small,resnet,resnet_fast",
+        ),
+        ("model=glob(resnet*)", "model=glob(resnet*): write the options out, as in model=resnet,resnet_fast"),
+        ("seed=glob(*)", "seed=glob(*): no list of values; write them out"),
+        ("seed=1,range(0,3)", "seed=1,range(0,3): Unexpected type annotation"),
         ("seed=range(0,1,0)", "seed=range(0,1,0): range() arg 3 must not be zero"),
         ("seed=range(0,1000000000)", "seed=range(0,1000000000): more than 10,000 values"),
         ("seed=shuffle(range(0,1000000000))", "seed=shuffle(range(0,1000000000)): more than 10,000 values"),
@@ -292,3 +305,30 @@ def test_a_key_given_twice_is_refused(line: str) -> None:
 @pytest.mark.thinned(4)
 def test_what_is_right_passes(line: str) -> None:
     check("config", Config, re.findall(r"(?:[^ ']|'[^']*')+", line))
+
+
+def test_a_sweep_kept_in_a_file_is_the_one_typed_out(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(
+        "model: [cnn, resnet]\noptimizer: {lr: [1e-3, 0.0001]}\nseed: range(0,2)\nenv.crop: [[0, 160, 210, 0]]\n"
+        "budget.steps: 100\nthreads: null\n"
+    )
+    texts = ["model=cnn,resnet", "optimizer.lr=1e-3,0.0001", "seed=range(0,2)", "env.crop=[0, 160, 210, 0]"]
+    found = located(["-m", f"sweep={tmp_path / 'mine.yaml'}", "threads=1"])
+    assert found == ["-m", *texts, "budget.steps=100", "threads=null", "threads=1"]
+    assert len(check("config", Config, found[:-1])) == 8
+
+
+@pytest.mark.parametrize("text", ["", "a", "- 1", "a: [", "a: !!python/name:os.system", None])
+def test_a_file_that_is_no_sweep_is_one_line(tmp_path: Path, text: str | None) -> None:
+    if text is not None:
+        (tmp_path / "mine.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=r"^sweep=.*mine\.yaml: should be a file with KEY: VALUE .*$"):
+        located([f"sweep={tmp_path / 'mine.yaml'}"])
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["objective=quantile,double_quantile objective.quantiles=11", "lr_schedule=linear,one_cycle lr_schedule.end=0.1"],
+)
+def test_a_key_that_all_swept_options_have_and_the_default_one_lacks_is_taken(line: str) -> None:
+    assert len(check("config", Config, ["-m", *line.split()])) == 2

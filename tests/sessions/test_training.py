@@ -28,7 +28,7 @@ from atlantis_exp.runs.journal import Artifact, Image, Journal, Metrics, Model, 
 from atlantis_exp.sessions import verifying
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.reporting import report
-from atlantis_exp.sessions.training import train
+from atlantis_exp.sessions.training import _kin, train
 from atlantis_exp.sessions.verifying import Session, fingerprints, run_and_kill, start, train_and_kill
 from atlantis_exp.tracking.mirror import publish
 from atlantis_exp.tracking.publishing import catch_up
@@ -110,6 +110,36 @@ def wait_for(condition: Callable[[], bool]) -> None:
     while not condition():
         assert time.monotonic() < patience
         time.sleep(0.02)
+
+
+def test_more_of_a_run_whose_plan_is_over_is_answered_with_what_begins_with_its_weights(
+    tiny: Compose, recorded: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = RunFolder(recorded())
+    train(Job(tiny("budget.steps=160")))
+    assert "adds nothing" not in capsys.readouterr().out
+    train(Job(tiny("budget.steps=600"), overrides=("phase.quick.steps=160", "budget.steps=600")))
+    out = capsys.readouterr().out
+    assert "budget.steps=600 adds nothing to a plan that is over" in out
+    assert (
+        f"atlantis_exp export run={folder.name} to=pretrained/{folder.name} paths.outputs={tiny().paths.outputs}" in out
+    )
+    assert out.endswith(f"atlantis_exp phase.quick.steps=160 training.weights=pretrained/{folder.name}\n")
+
+
+def test_a_longer_plan_says_which_run_is_the_same_over_a_shorter_one_and_why_it_begins_at_0(
+    tiny: Compose, recorded: Callable[..., Path]
+) -> None:
+    folder = RunFolder(recorded())
+    job = Job(tiny("phase.quick.steps=200"), overrides=("phase.quick.steps=200",))
+    said = _kin(job, RunFolder.of(job.config))
+    assert f"run {folder.name}, of 160 steps, is of another plan (epsilon=exponential follow" in said
+    assert f"phase.quick.steps=200 training.weights=pretrained/{folder.name}" in said
+    fixed = ("epsilon=constant", "epsilon.value=0.1")
+    recorded(*fixed)
+    job = Job(tiny(*fixed, "phase.quick.steps=200"))
+    assert "is of another plan: this one begins at step 0" in _kin(job, RunFolder.of(job.config))
+    assert _kin(Job(tiny("seed=1")), RunFolder.of(tiny("seed=1"))) == ""
 
 
 def test_a_run_that_has_ended_is_reported_and_not_trained_again(
@@ -509,9 +539,7 @@ def test_a_commit_that_the_disk_refuses_is_one_clear_line_and_costs_nothing_comm
 
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", full)
-        with pytest.raises(
-            Fault, match=r"paths\.outputs: .*No space left on device; make room there.*; continue with: "
-        ):
+        with pytest.raises(Fault, match=r"No space left on device; make room, or name .*; continue with: "):
             train(Job(config))
     folder = RunFolder.of(config)
     assert folder.state == "interrupted"

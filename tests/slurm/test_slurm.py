@@ -22,7 +22,8 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.sessions.job import Job, replaced
-from atlantis_exp.sessions.launchers.slurm import all_awaited
+from atlantis_exp.sessions.launchers import Launcher
+from atlantis_exp.sessions.launchers.slurm import submit
 from atlantis_exp.sessions.training import train
 from atlantis_exp.sessions.verifying import fingerprints
 
@@ -95,16 +96,23 @@ def test_slurm_where_there_is_none_and_wrong_settings_are_one_line(
     assert refusal("hydra.launcher.partion=x").startswith(
         "hydra.launcher.partion=x: no such key; did you mean 'hydra.launcher.partition'?"
     )
-    assert refusal("hydra.launcher.timeout_min=abc") == (
-        "Error merging override hydra.launcher.timeout_min=abc: "
-        "Value 'abc' of type 'str' could not be converted to Integer"
-    )
+    assert refusal("hydra.launcher.timeout_min=abc") == "hydra.launcher.timeout_min=abc: should be a number, as 240"
 
 
 @pytest.mark.skipif(not HAS_PLUGIN, reason="no submitit: pip install -e '.[slurm]'")
-def test_who_stops_waiting_for_jobs_is_told_that_they_go_on(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as left, all_awaited():
+def test_who_stops_waiting_for_jobs_is_told_that_they_go_on(
+    tiny: Compose, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import submitit
+
+    def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
+
+    monkeypatch.setattr(submitit.AutoExecutor, "map_array", interrupted)
+    monkeypatch.setattr(submitit.AutoExecutor, "__init__", lambda *_, **__: None)
+    monkeypatch.setattr(submitit.AutoExecutor, "update_parameters", lambda *_, **__: None)
+    with pytest.raises(SystemExit) as left:
+        submit([Job(tiny())], Launcher("slurm", {"max_num_timeout": 1}), lambda _: None)
     assert left.value.code == 130
     assert capsys.readouterr().err == (
         "atlantis_exp: the jobs go on; python -m atlantis_exp sync publishes what they do\n"

@@ -4,9 +4,9 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from types import FrameType
 from typing import NoReturn
 
@@ -21,29 +21,21 @@ from atlantis_exp.sessions.launchers import Launcher
 
 
 class _Running:
-    """The processes of the jobs under way, which SIGINT and SIGTERM of the sweep have commit and end."""
+    """The processes of the jobs under way."""
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         self.environment = environment
         self.has_ended = False
         self.processes: set[subprocess.Popen[str]] = set()
 
-    @contextmanager
-    def ended_by_signals(self) -> Iterator[None]:
-        def end(number: int, _: FrameType | None) -> NoReturn:
-            signal.signal(number, signal.SIG_DFL)  # a second one ends this process at once
-            self.has_ended = True
-            terminal.warn(f"{signal.Signals(number).name}: the jobs commit and end")
-            for process in [*self.processes]:
-                process.terminate()
-            sys.exit(128 + number)
-
-        handlers = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
+    def end(self, number: int, _: FrameType | None) -> NoReturn:
+        """Have the jobs commit and end on a signal; a second one ends this process at once."""
+        signal.signal(number, signal.SIG_DFL)
+        self.has_ended = True
+        terminal.warn(f"{signal.Signals(number).name}: the jobs commit and end")
+        for process in [*self.processes]:
+            process.terminate()
+        sys.exit(128 + number)
 
 
 def train_side_by_side(jobs: Sequence[Job], launcher: Launcher) -> None:
@@ -55,13 +47,14 @@ def train_side_by_side(jobs: Sequence[Job], launcher: Launcher) -> None:
     at_once, share = shared(all_cores(), launcher.settings["n_jobs"], jobs)
     # A person's own number of threads goes before.
     running = _Running({"OMP_NUM_THREADS": f"{share}", "MKL_NUM_THREADS": f"{share}", **os.environ, JOB_OF: "joblib"})
-    with running.ended_by_signals(), ThreadPoolExecutor(at_once, "job") as pool:
-        futures = [pool.submit(_train_apart, job, running) for job in jobs]
-        try:
+    handlers = {number: signal.signal(number, running.end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with ThreadPoolExecutor(at_once, "job") as pool:  # ends when its jobs have
+            futures = [pool.submit(_train_apart, job, running) for job in jobs]
             wait(futures)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
     for future in futures:
         future.result()
 

@@ -4,17 +4,15 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from atlantis_exp import terminal
-from atlantis_exp.faults import Fault
+from atlantis_exp.faults import Fault, in_words
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.launchers import Launcher
 
-_LOOK_SECONDS = 5.0  # between two questions to Slurm
 _SHARED = {  # settings that submitit has for every kind of cluster
     *("name", "timeout_min", "cpus_per_task", "gpus_per_node", "tasks_per_node", "mem_gb", "nodes", "stderr_to_stdout"),
 }
@@ -33,7 +31,7 @@ class _Training:
         try:
             self.train(overrides)
         except (Fault, OSError) as error:
-            return error if isinstance(error, Fault) else Fault(str(error))
+            return error if isinstance(error, Fault) else Fault(in_words(error))
         except Exception as error:
             traceback.print_exc()
             return Fault(f"{' '.join(overrides)}: {type(error).__name__}: {error}")
@@ -47,8 +45,13 @@ class _Training:
 
 
 def submit(jobs: Sequence[Job], launcher: Launcher, train: Train) -> None:
-    """Submit jobs as one array and wait for them. Raises: Fault, of the first job that failed once all have ended."""
+    """Submit jobs as one array and wait for all of them; an interrupt ends the waiting and says that they go on.
+
+    Raises:
+        Fault: of the first job that failed, or was cancelled or killed; or why Slurm took none.
+    """
     from submitit import AutoExecutor
+    from submitit.core.utils import UncompletedJobError
 
     settings = dict(launcher.settings)
     folder = jobs[0].outputs / "sweeps" / time.strftime("%Y-%m-%d_%H-%M-%S")
@@ -57,34 +60,18 @@ def submit(jobs: Sequence[Job], launcher: Launcher, train: Train) -> None:
     executor = AutoExecutor(folder / "%j", cluster="slurm", slurm_max_num_timeout=most_sessions)
     executor.update_parameters(**{key if key in _SHARED else f"slurm_{key}": value for key, value in settings.items()})
     print(f"what the jobs print is in {folder}", flush=True)
-    submitted = executor.map_array(_Training(train), [job.overrides for job in jobs])
-    for fault in [job.result() for job in submitted]:
-        if fault is not None:
-            raise fault
-
-
-@contextmanager
-def all_awaited() -> Iterator[None]:
-    """Wait for the other jobs where one that was cancelled or killed ends the waiting for results.
-
-    An interrupt ends the waiting and says that the jobs go on.
-
-    Raises:
-        Fault: names that job, or says why Slurm took none.
-    """
-    from submitit import SlurmJob
-    from submitit.core.utils import UncompletedJobError
-
+    faults = []
     try:
-        yield
-    except UncompletedJobError as error:
-        watcher = SlurmJob.watcher  # of all jobs that this process has submitted, and of their array
-        jobs = watcher._registered - {job.partition("_")[0] for job in watcher._registered if "_" in job}
-        while jobs - watcher._finished:
-            time.sleep(_LOOK_SECONDS)
-            watcher.update()
-        lines = str(error).splitlines()  # behind the first two comes all that the job has printed
-        raise Fault(" ".join(lines[:2]) if type(error) is UncompletedJobError else lines[-1]) from error
+        for job in executor.map_array(_Training(train), [job.overrides for job in jobs]):
+            try:
+                faults.append(job.result())
+            except UncompletedJobError as error:
+                lines = str(error).splitlines()  # behind the first two comes all that the job has printed
+                faults.append(Fault(" ".join(lines[:2])))
+    except UncompletedJobError as error:  # of sbatch
+        raise Fault(str(error).splitlines()[-1]) from error
     except (KeyboardInterrupt, SystemExit) as left:
         terminal.warn(f"the jobs go on; {terminal.PROGRAM} sync publishes what they do")
         sys.exit(getattr(left, "code", 128 + signal.SIGINT))
+    if failed := [fault for fault in faults if fault is not None]:
+        raise failed[0]

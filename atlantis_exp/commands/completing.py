@@ -1,0 +1,59 @@
+"""Shell completion: verbs, groups, options, keys and run names, without loading anything heavy."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from atlantis_exp.commands import VERBS, default_outputs
+from atlantis_exp.commands.helping import key_names, options_of
+
+SCRIPTS = {
+    "bash": """\
+_atlantis_exp() {
+    local line=${COMP_LINE:0:COMP_POINT} IFS=$' \\t\\n'
+    local words=($line)
+    [[ $line == *[[:space:]] ]] && words+=("")
+    local word=${words[-1]}
+    IFS=$'\\n'
+    COMPREPLY=($(atlantis-exp --complete "${words[@]:1}"))
+    [[ $word == *=* ]] && COMPREPLY=("${COMPREPLY[@]#"${word%%=*}="}")  # bash takes the rest for a word of its own
+    compopt -o nospace
+}
+complete -F _atlantis_exp atlantis-exp""",
+    "zsh": """\
+_atlantis_exp() {
+    local -a found
+    found=(${(f)"$(atlantis-exp --complete "${(@)words[2,CURRENT]}")"})
+    compadd -S '' -- $found
+}
+compdef _atlantis_exp atlantis-exp""",
+    "fish": "complete -c atlantis-exp -f -a '(atlantis-exp --complete (commandline -opc)[2..] (commandline -ct))'",
+}
+"""What a shell evaluates, as in `eval "$(atlantis-exp --completion bash)"`."""
+
+
+def complete(flag: str, words: Sequence[str]) -> str:
+    """Return what `--complete WORDS` prints, or the script of `--completion SHELL`."""
+    if flag == "--complete":
+        return "\n".join(candidates(words))
+    return SCRIPTS.get("".join(words), f"echo 'atlantis_exp: --completion: one of {', '.join(SCRIPTS)}' >&2")
+
+
+def candidates(words: Sequence[str]) -> list[str]:
+    """Return what the last of a command line's words may become."""
+    *before, word = words or [""]
+    verb = before[0] if before and before[0] in VERBS else "train"
+    key, equals, value = word.partition("=")
+    if not equals:
+        names = [*(VERBS if not before else ()), *(f"{name}=" for name in key_names(verb, before))]
+        return [name for name in dict.fromkeys(names) if name.startswith(word)]
+    first, comma, last = value.rpartition(",")
+    return [f"{key}={first}{comma}{each}" for each in _values(verb, key, before) if each.startswith(last)]
+
+
+def _values(verb: str, key: str, before: Sequence[str]) -> Iterator[str]:
+    yield from options_of(key)
+    if (key == "run" and verb in ("evaluate", "export")) or (key == "runs" and verb == "compare"):
+        typed = [text.partition("=")[2] for text in before if text.startswith("paths.outputs=")]
+        folder = Path(typed[-1]).expanduser() if typed else default_outputs()
+        names = sorted(path.name for path in (folder / "runs").glob("*/"))
+        yield from (name for name in names if name.isprintable())
