@@ -136,7 +136,7 @@ def test_no_game_is_played_where_nothing_can_be_recorded(
 ) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setattr(evaluating, "build_evaluator", lambda *_: pytest.fail("played"))
-    assert command(*words.split(), "tracking=none", f"paths.outputs={tmp_path}/file") == 1
+    assert command(*words.split(), "tracking=none", f"paths.outputs={tmp_path}/file") == 2
     assert re.fullmatch(r"atlantis_exp: .*/file.*\n", capsys.readouterr().err)
 
 
