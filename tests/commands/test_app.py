@@ -41,6 +41,7 @@ HAS_MPS = torch.backends.mps.is_available()
         pytest.param("device=mps paths.outputs=o", marks=pytest.mark.skipif(HAS_MPS, reason="this machine has one")),
         "new to=o",
         "new model=mynet",
+        "query -m hydra/launcher=joblib env=atlantis_v0,atlantis_v5",
     ],
 )
 def test_a_mistake_ends_with_code_2_and_one_line_and_leaves_nothing_behind(
