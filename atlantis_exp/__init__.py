@@ -1,17 +1,17 @@
 """Which network plays Atari Atlantis better on this machine, and how sure are we."""
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from atlantis_exp.api import compare, evaluate, train
     from atlantis_exp.comparison.frames import load_runs
 
-__all__ = ["load_runs"]
+__all__ = ["compare", "evaluate", "load_runs", "train"]
 
 
 def __getattr__(name: str) -> Any:
-    # Only who asks for it waits for it: pandas takes longer to import than a command to start.
-    if name == "load_runs":
-        from atlantis_exp.comparison.frames import load_runs
-
-        return load_runs
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    # Imported when asked for: pandas and MLflow take longer to import than a command to start.
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module("atlantis_exp.comparison.frames" if name == "load_runs" else "atlantis_exp.api"), name)

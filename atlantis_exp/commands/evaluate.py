@@ -39,7 +39,7 @@ def spell_out(arguments: list[str]) -> list[str]:
     return [re.sub(r"^(epsilon|episodes)=", r"evaluation.\1=", argument) for argument in arguments]
 
 
-def _work(asked: Asked[EvaluateConfig]) -> Callable[[], None]:
+def _work(asked: Asked[EvaluateConfig]) -> Callable[[], object]:
     from atlantis_exp.sessions.evaluating import evaluate
 
     keys = {override.split("=")[0].lstrip("+") for override in asked.overrides}

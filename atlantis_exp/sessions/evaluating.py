@@ -50,8 +50,8 @@ def evaluate(
     asked: Collection[str],
     command: str,
     cores: int,
-) -> None:
-    """Play a network on its own environment, print the report's table, and record it among the runs.
+) -> RunFolder:
+    """Play a network on its own environment, print the report's table, and return the folder that records it.
 
     An exported network plays by the protocol of its card, as far as no key in `asked` says otherwise.
     """
@@ -89,6 +89,7 @@ def evaluate(
     if card:
         table = side_by_side(card, evaluation, [episode.score for episode in played[0].episodes])
         terminal.console(least=130).print(table)
+    return recorded
 
 
 def _placeable(name: str) -> str:
