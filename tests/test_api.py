@@ -35,7 +35,7 @@ def test_a_mistake_is_raised_in_the_words_of_the_command_line(tmp_path: Path) ->
         atlantis_exp.train("-m", "seed=0,1", f"paths.outputs={tmp_path}")
     assert not [*tmp_path.iterdir()]
     with pytest.raises(AttributeError, match="no attribute 'trian'"):
-        _ = atlantis_exp.trian  # type: ignore[attr-defined]
+        _ = atlantis_exp.trian
 
 
 def test_ctrl_c_commits_a_training_which_the_same_call_continues(
