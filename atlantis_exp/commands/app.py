@@ -57,13 +57,14 @@ class Verb(Generic[T]):
             arguments = self.rewrite(list(typed))
             asked = self.asked(arguments, typed)
             flags = flags_of(arguments)
+            if flags.multirun:
+                interrupts.hold()
             if flags.cfg:
                 print(shown(self.config_name or self.name, arguments), end="")
             elif not flags.multirun:
                 with terminal.working(f"{self.name}: loading"):
                     call = self.work(asked[0])
-                if interrupts.seen():
-                    raise KeyboardInterrupt
+                interrupts.hold()
                 call()
             elif self.sweep is not None:
                 self.sweep(asked, launcher(arguments), arguments)
