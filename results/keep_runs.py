@@ -17,7 +17,7 @@ from atlantis_exp.runs.journal import NOTE, commit_bytes
 
 RUN = ("config.json", "result.json", "artifacts/episodes.csv", "artifacts/evaluation/*.csv")
 TABLES = ("looks", "verdict", "views", "runs")
-COMPARISON = ("config.json", "looks.json", "artifacts/figures/scores.png", *(f"artifacts/tables/{t}.csv" for t in TABLES))
+COMPARISON = ("config.json", "looks.json", *(f"artifacts/tables/{t}.csv" for t in TABLES))
 GRID = 5_000  # steps between two points of a kept curve
 WHOLE = 10_000  # steps at the end that keep every point
 
