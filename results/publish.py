@@ -1,6 +1,6 @@
 """Compute every published number from the kept runs, tables and cards into `results/numbers.json`.
 
-`python results/numbers.py` writes that file and the tables between `<!-- NAME -->` and `<!-- end -->` of the pages.
+`python -m results.publish` writes that file and the tables between `<!-- NAME -->` and `<!-- end -->` of the pages.
 The file leads from a page to its numbers, as text: `tests/test_results.py` looks for each on the page.
 """
 
@@ -9,6 +9,7 @@ import itertools
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -118,7 +119,9 @@ def of_the_verdicts() -> Iterator[tuple[str, str]]:
     for looks in sorted((RESULTS / "verdict" / "comparisons").glob("*/looks.json")):
         for look in json.loads(looks.read_text()).popitem()[1]:
             (verdict,) = look["verdicts"]
-            yield from ((LAB, text.lstrip("-")) for text in whole(verdict[key] for key in ("difference", "low", "high")))
+            yield from (
+                (LAB, text.lstrip("-")) for text in whole(verdict[key] for key in ("difference", "low", "high"))
+            )
     with next((RESULTS / "verdict/comparisons").glob("cnn-vs*")).joinpath("artifacts/tables/views.csv").open() as file:
         for row in csv.DictReader(file):
             if row["view"] != "equal hours":
@@ -201,7 +204,10 @@ def of_rewards() -> Iterator[tuple[str, str]]:
     yield from ((LAB, text) for text in whole((*means, np.mean(means), np.ptp(means), min(scores), max(scores))))
     for run in (*runs, longer):
         yield LAB, f"{60 * metrics_of(run, 'throughput/hours')[-1]:.0f}"
-        yield LAB, f"{games_at(run, 1_000_000).scores.mean():,.0f}" if run != longer else f"{pace_of(games_at(run))[1]:.1f}"
+        yield (
+            LAB,
+            f"{games_at(run, 1_000_000).scores.mean():,.0f}" if run != longer else f"{pace_of(games_at(run))[1]:.1f}",
+        )
     yield from ((LAB, f"{side_share(games):.0f}") for games in played)
 
 
@@ -223,7 +229,10 @@ def of_the_best_player() -> Iterator[tuple[str, str]]:
     last = games_at(after)
     lost = [length for end, length in ends_of(after) if length < last.steps.max()]
     yield from ((LAB, text) for text in whole((max(lost), pace_of(last)[2])))
-    yield LAB, f"| {metrics_of(after, 'throughput/hours')[-1]:.2f} | {int(last.truncated.sum())} of {len(last.scores)} |"
+    yield (
+        LAB,
+        f"| {metrics_of(after, 'throughput/hours')[-1]:.2f} | {int(last.truncated.sum())} of {len(last.scores)} |",
+    )
     for name, table in (("cnn_standard", "epsilon_0.001"), ("cnn_annealed", "annealed_epsilon_0.001")):
         card, _ = read_card(PRETRAINED / name)
         calm = EpisodeTable.read(RESULTS / "longer" / f"{table}.csv", SOURCES)
@@ -242,7 +251,9 @@ def of_the_reports_protocol() -> Iterator[tuple[str, str]]:
     for run in KEPT["reproduction"]:
         assert run.result is not None
         counts, config = run.result.counts, run.trained_config
-        cells = f"{run.result.steps:,} | {counts['updates']:,.0f} | {counts['hours']:.2f} | {mean_and_iqm(games_at(run))}"
+        cells = (
+            f"{run.result.steps:,} | {counts['updates']:,.0f} | {counts['hours']:.2f} | {mean_and_iqm(games_at(run))}"
+        )
         yield REPRODUCTION, f"| {config.seed} | {cells} |"
     scores = [games_at(run).scores.mean() for run in KEPT["reproduction"] if run.name.startswith("cnn")]
     numbers = (np.mean(scores), *mean_interval(scores), min(scores), max(scores), np.std(scores, ddof=1))
@@ -268,12 +279,14 @@ SECTIONS = (
 )
 
 
+@cache
 def numbers() -> dict[str, list[str]]:
     """Return every published number, by page."""
     said = list(dict.fromkeys(itertools.chain.from_iterable(section() for section in SECTIONS)))
     return {page: [text for of, text in said if of == page] for page in (LAB, REPRODUCTION)}
 
 
+@cache
 def tables() -> dict[str, str]:
     """Return the tables of the pages, by the name in the comment before each."""
     answers = ["| trainings | seeds | mean | lowest | highest |", "| --- | ---: | ---: | ---: | ---: |"]
@@ -297,7 +310,9 @@ def tables() -> dict[str, str]:
     for run in sorted(KEPT["reproduction"], key=lambda run: (run.name.split("-")[0], run.trained_config.seed)):
         assert run.result is not None
         counts = run.result.counts
-        cells = f"{run.result.steps:,} | {counts['updates']:,.0f} | {counts['hours']:.2f} | {mean_and_iqm(games_at(run))}"
+        cells = (
+            f"{run.result.steps:,} | {counts['updates']:,.0f} | {counts['hours']:.2f} | {mean_and_iqm(games_at(run))}"
+        )
         report.append(f"| `{run.trained_config.model.name}` | {run.trained_config.seed} | {cells} |")
     named = {"answers": answers, "field": field, "players": players, "report": report}
     return {name: "\n".join(lines) for name, lines in named.items()}
