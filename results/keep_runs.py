@@ -1,8 +1,8 @@
 """Copy finished runs, comparisons and decisions in the smallest form that `compare`, `sync` and `load_runs` read.
 
 `python results/keep_runs.py OUTPUTS TARGET`: each folder beside this file is such a target. Weights, films, pages and
-this machine's paths are left out, and so are comparisons without a look. Of a training's curve a point every 5,000 steps
-stays, with five digits, and the whole of the last 10,000 steps.
+this machine's paths are left out, and so are comparisons without a look. Of a training's curve a point every 5,000
+steps stays, with five digits, and the whole of the last 10,000 steps.
 """
 
 import json
