@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.runs.journal import Metrics
+from atlantis_exp.sessions.cards import read_card
 from results import publish
 from results.publish import KEPT, LAB, RESULTS, games_at, of_the_verdict, to_a_power
 
@@ -88,7 +90,7 @@ def test_what_the_answers_rank_is_ranked_so_by_the_kept_runs() -> None:
 def test_the_best_player_is_the_last_of_its_training_and_begins_with_the_one_before() -> None:
     _, run = sorted(to_a_power("longer"), key=lambda each: each.trained_config.training.weights or "")
     config = run.trained_config
-    before, card = (publish.read_card(publish.PRETRAINED / name)[0] for name in ("cnn_standard", "cnn_annealed"))
+    before, card = (read_card(publish.PRETRAINED / name)[0] for name in ("cnn_standard", "cnn_annealed"))
     assert config.training.weights == f"pretrained/cnn_standard@{before.sha256[:16]}"
     assert (card.run, card.step) == (run.name, config.budget.steps)
     assert (config.lr_schedule.name, config.replay.capacity) == ("linear", config.budget.steps)
@@ -148,7 +150,7 @@ def test_a_kept_curve_has_a_point_every_5000_steps_and_its_whole_end() -> None:
     points = [
         record.step
         for record in of_the_verdict("cnn")[2].records()
-        if isinstance(record, publish.Metrics) and "throughput/hours" in record.values
+        if isinstance(record, Metrics) and "throughput/hours" in record.values
     ]
     assert points == [1_000, *range(5_000, 990_001, 5_000), *range(991_000, 1_000_001, 1_000)]
 
