@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -104,7 +105,7 @@ def side_share(games: EpisodeTable) -> float:
     return 100 * hits["side_bomber"] / (hits["side_bomber"] + hits["centre_bomber"])
 
 
-def whole(values: Iterable[float]) -> list[str]:
+def whole(values: Iterable[Any]) -> list[str]:
     """Return numbers as pages have them."""
     return [f"{value:,.0f}" for value in values]
 
@@ -162,7 +163,8 @@ def of_three_networks() -> Iterator[tuple[str, str]]:
     yield LAB, f"{flops / config.training.batch_size / 1e9:.2f} GFLOP"
     scores = np.concatenate([games_at(run).scores for run in of_the_verdict("resnet", precision="bf16").values()])
     ten = [[games_at(run).scores.mean() for run in of_the_verdict(model).values()] for model in ("cnn", "resnet_fast")]
-    yield from ((LAB, text) for each in (scores, *ten) for text in whole((min(each), max(each))))
+    for each in (scores.tolist(), *ten):
+        yield from ((LAB, text) for text in whole((min(each), max(each))))
     yield LAB, f"{EpisodeTable.read(DATA / 'resnet_in_bfloat16.csv').scores.mean():,.0f}"
 
 
@@ -256,7 +258,7 @@ def of_the_reports_protocol() -> Iterator[tuple[str, str]]:
         )
         yield REPRODUCTION, f"| {config.seed} | {cells} |"
     scores = [games_at(run).scores.mean() for run in KEPT["reproduction"] if run.name.startswith("cnn")]
-    numbers = (np.mean(scores), *mean_interval(scores), min(scores), max(scores), np.std(scores, ddof=1))
+    numbers = (float(np.mean(scores)), *mean_interval(scores), min(scores), max(scores), float(np.std(scores, ddof=1)))
     yield from ((REPRODUCTION, text.lstrip("-")) for text in whole(numbers))
     (run,) = [run for run in KEPT["reproduction"] if run.name.startswith("resnet")]
     assert run.result is not None

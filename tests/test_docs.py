@@ -144,7 +144,7 @@ def lost_links(path: Path) -> set[str]:
 
 LONG = {"comparison.md", "verdict-procedure.md"}  # not cut yet
 PAGES = [REPOSITORY / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")]
-PAGES += [*DOCS.glob("*.md"), *(REPOSITORY / "lab").glob("*.md")]
+PAGES += [*DOCS.glob("*.md"), *(REPOSITORY / "lab").glob("*.md"), REPOSITORY / "results" / "README.md"]
 SHORT = [path for path in PAGES if path.name not in LONG and path.parent.name != "lab"]
 
 
