@@ -38,12 +38,8 @@ def in_the_site(text: str, name: str) -> str:
         text = re.sub(rf"\]\((?:\.\./)?{source}\.md", f"]({up}{page}", text)
     text = re.sub(r"(\]\(|src=\")(?:\.\./)?docs/", rf"\g<1>{up}", text)
     text = re.sub(r"\]\((?:\.\./)?lab/", f"]({up}lab/", text)
-    return re.sub(
-        r"\[([^\]]+)\]\((?:\.\./)*(?:results|pretrained|examples|conf|SECURITY\.md)[^)]*\)",
-        r"\1",
-        text,
-        flags=re.DOTALL,
-    )
+    elsewhere = r"(?:results|pretrained|examples|conf)(?:/[^)]*)?|SECURITY\.md"
+    return re.sub(rf"\[([^\]]+)\]\((?:\.\./)*(?:{elsewhere})\)", r"\1", text)
 
 
 def verbs() -> str:

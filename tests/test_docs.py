@@ -156,6 +156,7 @@ def test_the_links_of_a_page_lead_somewhere(path: Path) -> None:
 def test_the_links_of_the_site_lead_somewhere_and_each_page_is_in_its_navigation(site: Path) -> None:
     pages = {path.relative_to(site).as_posix(): lost_links(path) for path in site.rglob("*.md")}
     assert {name: lost for name, lost in pages.items() if lost} == {}
+    assert {"results.md", "contributing.md", "images/game.png"} <= links_of(site / "index.md")
     navigation = (REPOSITORY / "mkdocs.yml").read_text().partition("\nnav:")[2]
     assert sorted(re.findall(r": (\S+\.md)$", navigation, re.MULTILINE)) == sorted(pages)
 
