@@ -30,7 +30,7 @@ SEEDS = 10  # a group
 GROUPS = (2, 4, 8)
 NOISE = 0.1  # within a mode, in distances between the two
 RESAMPLES = 999
-KEPT = Path(__file__).resolve().parents[1] / "docs" / "verdict" / "runs"
+KEPT = Path(__file__).resolve().parents[1] / "results" / "verdict" / "runs"
 NETWORKS = ("cnn", "resnet_fast")  # of which ten seeds are kept
 
 

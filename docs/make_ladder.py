@@ -1,4 +1,4 @@
-"""Draw `docs/images/ladder.png` from `docs/data/ladder.csv` and print the table of docs/results.md.
+"""Draw `docs/images/ladder.png` from `docs/data/ladder.csv` and print the table of lab/results.md.
 
 `python docs/make_ladder.py [OUTPUTS...]`, from the root of the checkout. The finished trainings in the folders OUTPUTS
 enter the data first, in the place of what it has of runs of the same names.

@@ -1,4 +1,4 @@
-"""Draw `docs/images/fast.png` from `docs/data/fast.csv`: scores of docs/results.md by steps and by hours.
+"""Draw `docs/images/fast.png` from `docs/data/fast.csv`: scores by steps and by hours.
 
 `python docs/make_results_picture.py [OUTPUTS...]`, from the root of the checkout. The trainings in the
 folders OUTPUTS enter the table first, in the place of what it has of runs of the same names.

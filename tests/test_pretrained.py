@@ -1,6 +1,5 @@
 """The weights that come with the repository: each folder is what its card says."""
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -30,12 +29,10 @@ def test_a_folder_is_what_its_card_says(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
-def test_the_readme_says_what_a_folder_scores(folder: Path) -> None:
+def test_the_page_of_results_has_what_a_folder_scores(folder: Path) -> None:
     card, _ = read_card(folder)
-    readme = " ".join((REPOSITORY / "README.md").read_text().split())
-    about = readme.split(f"`pretrained/{folder.name}` is ")[1].split("`pretrained/")[0]
-    scores = re.findall(r"([\d,]+) over (\d+)", about)
-    assert (f"{np.mean(card.scores):,.0f}", str(len(card.scores))) in scores
+    cells = f"`{card.config.model.name}` | {np.mean(card.scores):,.0f} | {len(card.scores)}"
+    assert f"| `pretrained/{folder.name}` | {cells} |" in (REPOSITORY / "docs" / "results.md").read_text()
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)

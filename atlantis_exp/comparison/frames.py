@@ -1,4 +1,4 @@
-"""Run folders as pandas data frames, for a notebook; docs/notebooks.md lists their columns."""
+"""Run folders as pandas data frames, for a notebook; docs/columns.md lists their columns."""
 
 import json
 import sys

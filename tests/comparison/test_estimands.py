@@ -7,8 +7,8 @@ import pytest
 
 from atlantis_exp.comparison.estimands import FEWEST_EPISODES, TrainingEpisodes, training_score
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-KEPT = sorted((DOCS / "verdict" / "runs").glob("*-uniform-s*"))
+RESULTS = Path(__file__).resolve().parents[2] / "results"
+KEPT = sorted((RESULTS / "verdict" / "runs").glob("*-uniform-s*"))
 
 
 def naive(episodes: TrainingEpisodes, steps: int, num_envs: int, window: float) -> float:
@@ -89,7 +89,7 @@ def test_it_is_unbiased_where_the_mean_of_the_ended_episodes_lags(mean: float, g
     ],
 )
 def test_games_that_outlast_the_window_are_refused(folder: str, run: str, steps: int) -> None:
-    table = TrainingEpisodes.read(DOCS / folder / "runs" / run / "artifacts" / "episodes.csv")
+    table = TrainingEpisodes.read(RESULTS / folder / "runs" / run / "artifacts" / "episodes.csv")
     with pytest.raises(ValueError, match=rf"episodes ended in the last 20% of {steps:,} steps, and .* needs 30"):
         training_score(table, steps, 16)
     one_short = TrainingEpisodes(np.linspace(900, 930, FEWEST_EPISODES - 1), np.ones(29), np.ones(29))

@@ -28,6 +28,7 @@ from atlantis_exp.training.evaluation import Episode, Evaluation
 Recorded = Callable[..., Path]
 ATLANTIS = facts_of(game_of("Atlantis-v0"))
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "notebooks.md"
+COLUMNS = PAGE.with_name("columns.md")
 
 
 def episodes(*scores: float) -> Evaluation:
@@ -316,7 +317,7 @@ def test_the_page_lists_all_columns_with_their_units(recorded: Recorded, tmp_pat
     recorded()
     loaded = load_runs(tmp_path)
     listed = {}
-    for section in re.split(r"^`loaded\.", PAGE.read_text().partition("## Columns")[2], flags=re.MULTILINE)[1:]:
+    for section in re.split(r"^`loaded\.", COLUMNS.read_text().partition("## Columns")[2], flags=re.MULTILINE)[1:]:
         rows = re.findall(r"^\| (`.*?) \| (.*?) ?\|", section, re.MULTILINE)
         listed[section.partition("`")[0]] = {
             name: unit for names, unit in rows for name in re.findall(r"`(.+?)`", names)

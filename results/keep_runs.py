@@ -1,0 +1,89 @@
+"""Copy finished runs, comparisons and decisions in the smallest form that `compare`, `sync` and `load_runs` read.
+
+`python results/keep_runs.py OUTPUTS TARGET`: each folder beside this file is such a target. Weights, films, pages and
+this machine's paths are left out, and so are comparisons without a look. Of a training's curve a point every 5,000
+steps stays, with five digits, and the whole of the last 10,000 steps.
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from atlantis_exp.runs.folder import RunFolder, all_runs
+from atlantis_exp.runs.journal import NOTE, commit_bytes
+
+RUN = ("config.json", "result.json", "artifacts/episodes.csv", "artifacts/evaluation/*.csv")
+TABLES = ("looks", "verdict", "views", "runs")
+COMPARISON = ("config.json", "looks.json", *(f"artifacts/tables/{t}.csv" for t in TABLES))
+GRID = 5_000  # steps between two points of a kept curve
+WHOLE = 10_000  # steps at the end that keep every point
+
+
+def main(outputs: Path, target: Path) -> None:
+    """Copy each finished run, comparison and decision of an outputs folder, replacing what has its name."""
+    for run in all_runs(outputs):
+        if run.result is not None:
+            keep(run, RUN, target, run.result.steps)
+    for looks in sorted(outputs.glob("comparisons/*/looks.json")):
+        if any(json.loads(looks.read_bytes()).values()):
+            keep(RunFolder(looks.parent), COMPARISON, target)
+    for journal in sorted(outputs.glob("decisions/*/journal.jsonl")):
+        keep(RunFolder(journal.parent), ("config.json",), target)  # names the runs that its comparison reads
+
+
+def keep(run: RunFolder, names: Sequence[str], target: Path, steps: int = 0) -> None:
+    """Copy a folder; its outputs folder is then called `outputs`, and it belongs to no sweep."""
+    place = bytes(run.path.parents[1].absolute())
+    target = target / run.path.parent.name / run.name
+
+    def without_place(content: bytes) -> bytes:
+        return content.replace(place, b"outputs")
+
+    commit = run.commit
+    assert commit is not None
+    journal = without_place(thinned((run.path / "journal.jsonl").read_bytes()[: commit.offset], steps))
+    files = {"journal.jsonl": journal, "commit.json": commit_bytes(replace(commit, offset=len(journal), parent=""))}
+    for name in names:
+        for path in run.path.glob(name):
+            files[str(path.relative_to(run.path))] = without_place(path.read_bytes())
+    for name, content in files.items():
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        (target / name).write_bytes(content)
+    print(target)
+
+
+def thinned(journal: bytes, steps: int) -> bytes:
+    """Return a journal with fewer points of its training's curve, only the last note, and no file that is not kept."""
+    lines, records = journal.splitlines(keepends=True), [json.loads(line) for line in journal.splitlines()]
+    last_note = max((at for at, record in enumerate(records) if NOTE in record.get("values", {})), default=-1)
+    first = next((at for at, record in enumerate(records) if is_of_the_curve(record)), -1)
+    kept, taken = list[bytes](), -1  # the cell of the grid that has its point
+    for at, (line, record) in enumerate(zip(lines, records, strict=True)):
+        if record["kind"] in ("image", "model") or (set(record.get("values", {})) == {NOTE} and at != last_note):
+            continue
+        if is_of_the_curve(record):
+            cell, is_late = record["step"] // GRID, record["step"] > steps - WHOLE
+            if not (at == first or cell > taken or is_late):
+                continue
+            taken = cell
+            line = line if is_late else shortened(record)
+        kept.append(line)
+    return b"".join(kept)
+
+
+def is_of_the_curve(record: dict[str, Any]) -> bool:
+    """Tell whether a record is a point of a training's curve and not of an evaluation at the same step."""
+    return record["kind"] == "metrics" and "throughput/hours" in record["values"]
+
+
+def shortened(record: dict[str, Any]) -> bytes:
+    """Return a record's line; its fractions have five digits."""
+    values = {key: value if value == int(value) else float(f"{value:.5g}") for key, value in record["values"].items()}
+    return json.dumps(record | {"values": values}, separators=(",", ":")).encode() + b"\n"
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
