@@ -22,6 +22,10 @@ FEWEST_EPISODES = 30  # that must end in the window
 _EQUAL = 0.01  # difference in epsilon below which two trainings explored alike
 
 
+class TooFewEpisodes(ValueError):
+    """The window holds too few ends of episodes for a score."""
+
+
 @dataclass(frozen=True)
 class TrainingEpisodes:
     """The episodes that ended during a training, one row each."""
@@ -55,13 +59,13 @@ def training_score(episodes: TrainingEpisodes, steps: int, num_envs: int, window
         steps: of the whole training, of all environments together.
 
     Raises:
-        ValueError: where fewer than `FEWEST_EPISODES` episodes ended in the window.
+        TooFewEpisodes: where fewer than `FEWEST_EPISODES` episodes ended in the window.
     """
     start = steps * (1 - window)
     ended = episodes.ends > start
     if (count := int(ended.sum())) < FEWEST_EPISODES:
-        raise ValueError(
-            f"{count} episodes ended in the last {window:.0%} of {steps:,} steps, and a training score needs "
+        raise TooFewEpisodes(
+            f"{count} episodes ended in the last {100 * window:g}% of {steps:,} steps, and a training score needs "
             f"{FEWEST_EPISODES}: take a wider window, or the score of an evaluation"
         )
     lengths = episodes.lengths[ended]
@@ -90,8 +94,8 @@ def by_training(trainings: Sequence[Training], outputs: Path, window: float) -> 
     least, most = min(explored, key=explored.__getitem__), max(explored, key=explored.__getitem__)
     if not explored[most] - explored[least] <= _EQUAL:
         raise ConfigError(
-            f"score=training: epsilon differs in the last {window:.0%} of the steps, so the scores do not mean the "
-            f"same: {explored[least]:.3g} in {least}; {explored[most]:.3g} in {most}; score=last compares the networks"
+            f"score=training: epsilon differs in the last {100 * window:g}% of the steps, so the scores do not mean "
+            f"the same: {explored[least]:.3g} in {least}; {explored[most]:.3g} in {most}; score=last compares the networks"
         )
     scored = []
     for training in trainings:

@@ -19,9 +19,9 @@ def measure(question: Question) -> str:
             return "the interquartile mean (IQM) of the seed's evaluated episodes after its last step"
         case "training":
             return (
-                f"the seed's points in the last {question.window:.0%} of its training over the episodes that ended "
-                "there: with the training's epsilon and latest weights, so it measures the process of learning, not "
-                "the network one keeps"
+                f"the seed's points in the last {100 * question.window:g}% of its training over the episodes that "
+                "ended there: with the training's epsilon and latest weights, so it measures the process of learning, "
+                "not the network one keeps"
             )
         case _:
             return "the mean of the seed's rows in a table"
