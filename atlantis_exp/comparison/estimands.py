@@ -95,7 +95,8 @@ def by_training(trainings: Sequence[Training], outputs: Path, window: float) -> 
     if not explored[most] - explored[least] <= _EQUAL:
         raise ConfigError(
             f"score=training: epsilon differs in the last {100 * window:g}% of the steps, so the scores do not mean "
-            f"the same: {explored[least]:.3g} in {least}; {explored[most]:.3g} in {most}; score=last compares the networks"
+            f"the same: {explored[least]:.3g} in {least}; {explored[most]:.3g} in {most}; "
+            "score=last compares the networks"
         )
     scored = []
     for training in trainings:

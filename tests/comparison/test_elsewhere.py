@@ -30,7 +30,10 @@ def test_columns_may_have_other_names(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("group,seed,scor\na,1,2\n", "row 1, column score: no such column; did you mean 'scor'?; columns.score=NAME"),
+        (
+            "group,seed,scor\na,1,2\n",
+            "row 1, column score: no such column; did you mean 'scor'? (valid: group, scor, seed); columns.score=NAME",
+        ),
         ("group,seed,score,score\na,1,2,3\n", "row 1, column score: several such columns"),
         ("", "row 1, column group: no such column"),
         ("group,seed,score\n", "row 2, column group: there is no row below the header"),

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from atlantis_exp.commands.app import Asked
+from atlantis_exp.commands.check import _work
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.components import KINDS, admit
 from atlantis_exp.config import Config
