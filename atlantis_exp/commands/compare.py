@@ -21,15 +21,6 @@ if TYPE_CHECKING:
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
-class ColumnsConfig:
-    """The names of columns in a table of scores."""
-
-    group: str
-    seed: str
-    score: str
-
-
-@dataclass(config=STRICT, kw_only=True, frozen=True)
 class CompareConfig:
     """Finished runs as groups, and what tells them apart."""
 
@@ -40,7 +31,7 @@ class CompareConfig:
     score: Literal["last", "training"]
     window: str | float  # of score=training, a share of the steps
     scores: str | None  # a CSV file in place of runs
-    columns: ColumnsConfig
+    columns: list[str]  # group=NAME, seed=NAME, score=NAME, of that file
     baseline: str | None  # a value of one of the keys of by, or a group; null: all pairs
     delta: str | float | None  # a difference that does not matter: 5% of a score, or points
     seeds: Annotated[int, Field(ge=5, le=10_000)]  # a group, at the last look
@@ -56,7 +47,17 @@ class CompareConfig:
         of_runs = {"by": self.by != ["model"], "score": self.score != "last", "at_epsilon": self.at_epsilon is not None}
         of_runs |= {"runs": bool(self.runs), "where": bool(self.where)}
         if self.scores is not None and (key := next((key for key, is_asked in of_runs.items() if is_asked), None)):
-            raise ConfigError(f"{key}: is of runs, not of scores={self.scores}, whose columns columns.group=NAME names")
+            raise ConfigError(f"{key}: is of runs, not of scores={self.scores}, grouped by columns=group=NAME")
+        self.named_columns  # noqa: B018
+
+    @property
+    def named_columns(self) -> dict[str, str]:
+        """The columns of the table of scores that have names of their own. Raises: ConfigError."""
+        named = dict(text.partition("=")[::2] for text in self.columns)
+        for key, name in named.items():
+            if key not in ("group", "seed", "score") or not name:
+                raise ConfigError(f"columns={key}={name}: write group=NAME, seed=NAME or score=NAME")
+        return named
 
     @property
     def question(self) -> "Question":
@@ -85,7 +86,7 @@ def margin(delta: str | float | None) -> tuple[float | None, bool]:
 def list_out(arguments: list[str]) -> list[str]:
     """Let a list be written without brackets, as in `by=model,sampler`."""
     # Hydra itself would take the commas for a sweep, and a second `=` for a mistake.
-    return [re.sub(r"^(by|runs|where)=([^\[].*)$", listed, argument) for argument in as_texts(arguments)]
+    return [re.sub(r"^(by|runs|where|columns)=([^\[].*)$", listed, argument) for argument in as_texts(arguments)]
 
 
 def as_texts(arguments: Iterable[str]) -> list[str]:
@@ -105,7 +106,7 @@ def _work(asked: Asked[CompareConfig]) -> Callable[[], object]:
     config = asked.config
     scores = None if config.scores is None else absolute("scores", config.scores)
     choice = Choice(
-        *(Path(config.paths.outputs), config.runs, config.where, config.at_epsilon), scores, vars(config.columns)
+        *(Path(config.paths.outputs), config.runs, config.where, config.at_epsilon), scores, config.named_columns
     )
 
     def call() -> None:

@@ -12,21 +12,22 @@ from atlantis_exp.comparison.verdict import Group
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.files import SMALL, read_file
 
-COLUMNS: Mapping[str, str] = {name: name for name in ("group", "seed", "score")}
-"""What a row says, by the name of its column."""
+_COLUMNS = ("group", "seed", "score")
 _MOST_GROUPS = 100
 _MOST_SEEDS = 10_000  # of a group, as many as a plan may have
 _LONGEST = 100  # characters of a group's name
 
 
-def read_scores(path: Path, columns: Mapping[str, str] = COLUMNS) -> list[Group]:
+def read_scores(path: Path, columns: Mapping[str, str]) -> list[Group]:
     """Read the groups of a table with a row for each episode, evaluation or seed; rows of one seed are averaged.
 
-    Columns that `columns` does not name are not read.
+    Args:
+        columns: the names of the columns for group, seed and score where these are not theirs. No other one is read.
 
     Raises:
         ConfigError: naming the row and the column that cannot be read.
     """
+    columns = {name: name for name in _COLUMNS} | columns
     found: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     try:
         reader = csv.DictReader(io.StringIO(read_file(path, SMALL).decode("utf-8-sig"), newline=""), strict=True)
@@ -34,7 +35,8 @@ def read_scores(path: Path, columns: Mapping[str, str] = COLUMNS) -> list[Group]
         for key, name in columns.items():
             if header.count(name) != 1:
                 which = "no such column" if name not in header else "several such columns"
-                raise ValueError(f"row 1, column {name}: {which}; {nearest(name, header)}; columns.{key}=NAME names it")
+                which += f"; {nearest(name, header)}; columns={key}=NAME says which"
+                raise ValueError(f"row 1, column {name}: {which}")
         for row in reader:
             label, seed, score = (_read(reader.line_num, row, columns, key) for key in ("group", "seed", "score"))
             found[str(label)][int(seed)].append(float(score))

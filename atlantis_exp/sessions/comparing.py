@@ -23,7 +23,7 @@ from atlantis_exp.comparison.choosing import (
     select,
     shortened,
 )
-from atlantis_exp.comparison.elsewhere import COLUMNS, read_scores
+from atlantis_exp.comparison.elsewhere import read_scores
 from atlantis_exp.comparison.estimands import by_training
 from atlantis_exp.comparison.export_tables import to_latex, with_units
 from atlantis_exp.comparison.figures import Drawn, draw
@@ -53,7 +53,7 @@ class Choice:
     where: Sequence[str] = ()  # KEY=VALUE
     at_epsilon: float | None = None  # of the evaluations; None: each run's latest
     scores: Path | None = None  # a table of the scores of seeds that were trained elsewhere, in place of runs
-    columns: Mapping[str, str] = field(default_factory=lambda: dict(COLUMNS))  # of that table
+    columns: Mapping[str, str] = field(default_factory=dict)  # of that table: group, seed or score to its name
 
 
 def compare(
