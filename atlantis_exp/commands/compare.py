@@ -48,16 +48,7 @@ class CompareConfig:
         of_runs |= {"runs": bool(self.runs), "where": bool(self.where)}
         if self.scores is not None and (key := next((key for key, is_asked in of_runs.items() if is_asked), None)):
             raise ConfigError(f"{key}: is of runs, not of scores={self.scores}, grouped by columns=group=NAME")
-        self.named_columns  # noqa: B018
-
-    @property
-    def named_columns(self) -> dict[str, str]:
-        """The columns of the table of scores that have names of their own. Raises: ConfigError."""
-        named = dict(text.partition("=")[::2] for text in self.columns)
-        for key, name in named.items():
-            if key not in ("group", "seed", "score") or not name:
-                raise ConfigError(f"columns={key}={name}: write group=NAME, seed=NAME or score=NAME")
-        return named
+        named(self.columns)
 
     @property
     def question(self) -> "Question":
@@ -83,6 +74,15 @@ def margin(delta: str | float | None) -> tuple[float | None, bool]:
     return value, text.endswith("%")
 
 
+def named(columns: Iterable[str]) -> dict[str, str]:
+    """Return the columns of a table of scores that have names of their own. Raises: ConfigError."""
+    names = dict(text.partition("=")[::2] for text in columns)
+    for key, name in names.items():
+        if key not in ("group", "seed", "score") or not name:
+            raise ConfigError(f"columns={key}={name}: write group=NAME, seed=NAME or score=NAME")
+    return names
+
+
 def list_out(arguments: list[str]) -> list[str]:
     """Let a list be written without brackets, as in `by=model,sampler`."""
     # Hydra itself would take the commas for a sweep, and a second `=` for a mistake.
@@ -106,7 +106,7 @@ def _work(asked: Asked[CompareConfig]) -> Callable[[], object]:
     config = asked.config
     scores = None if config.scores is None else absolute("scores", config.scores)
     choice = Choice(
-        *(Path(config.paths.outputs), config.runs, config.where, config.at_epsilon), scores, config.named_columns
+        *(Path(config.paths.outputs), config.runs, config.where, config.at_epsilon), scores, named(config.columns)
     )
 
     def call() -> None:

@@ -27,7 +27,7 @@ def read_scores(path: Path, columns: Mapping[str, str]) -> list[Group]:
     Raises:
         ConfigError: naming the row and the column that cannot be read.
     """
-    columns = {name: name for name in _COLUMNS} | columns
+    columns = dict(zip(_COLUMNS, _COLUMNS, strict=True)) | dict(columns)
     found: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     try:
         reader = csv.DictReader(io.StringIO(read_file(path, SMALL).decode("utf-8-sig"), newline=""), strict=True)
@@ -38,7 +38,7 @@ def read_scores(path: Path, columns: Mapping[str, str]) -> list[Group]:
                 which += f"; {nearest(name, header)}; columns={key}=NAME says which"
                 raise ValueError(f"row 1, column {name}: {which}")
         for row in reader:
-            label, seed, score = (_read(reader.line_num, row, columns, key) for key in ("group", "seed", "score"))
+            label, seed, score = (_read(reader.line_num, row, columns, key) for key in _COLUMNS)
             found[str(label)][int(seed)].append(float(score))
             if len(found) > _MOST_GROUPS or len(found[str(label)]) > _MOST_SEEDS:
                 raise ValueError(

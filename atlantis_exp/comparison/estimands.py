@@ -22,10 +22,6 @@ FEWEST_EPISODES = 30  # that must end in the window
 _EQUAL = 0.01  # difference in epsilon below which two trainings explored alike
 
 
-class TooFewEpisodes(ValueError):
-    """The window holds too few ends of episodes for a score."""
-
-
 @dataclass(frozen=True)
 class TrainingEpisodes:
     """The episodes that ended during a training, one row each."""
@@ -59,12 +55,12 @@ def training_score(episodes: TrainingEpisodes, steps: int, num_envs: int, window
         steps: of the whole training, of all environments together.
 
     Raises:
-        TooFewEpisodes: where fewer than `FEWEST_EPISODES` episodes ended in the window.
+        ValueError: where fewer than `FEWEST_EPISODES` episodes ended in the window.
     """
     start = steps * (1 - window)
     ended = episodes.ends > start
     if (count := int(ended.sum())) < FEWEST_EPISODES:
-        raise TooFewEpisodes(
+        raise ValueError(
             f"{count} episodes ended in the last {100 * window:g}% of {steps:,} steps, and a training score needs "
             f"{FEWEST_EPISODES}: take a wider window, or the score of an evaluation"
         )

@@ -12,7 +12,7 @@ import numpy as np
 
 from atlantis_exp.checking import share
 from atlantis_exp.comparison.choosing import select
-from atlantis_exp.comparison.estimands import TooFewEpisodes, score_of
+from atlantis_exp.comparison.estimands import score_of
 from atlantis_exp.comparison.gather import (
     NOT_STARTED,
     PUT_ASIDE,
@@ -133,10 +133,10 @@ def load_runs(
 
 
 def _training_score(run: StoredRun, window: float) -> float:
-    """Return the training score, NaN with a warning if there is none. Raises: as UNREADABLE, of a damaged table."""
+    """Return the training score, NaN with a warning if there is none."""
     try:
         return score_of(run.folder, window)
-    except TooFewEpisodes as error:
+    except (ValueError, OSError) as error:
         warnings.warn(f"{run.name} has no training score: {error}", stacklevel=3)
         return float("nan")
 
