@@ -91,6 +91,11 @@ class Contest:
             self.contenders[label] = (each, job)
         if mixed := mixed_protocol({groups[each].label: facts[each] for each in chosen}, by):
             raise ConfigError(f"{mixed[1]}; give that key itself several values, or train them under one protocol")
+        explored = [
+            {key: value for key, value in each.items() if key.startswith("epsilon.")} for each in facts.values()
+        ]
+        if question.score == "training" and any(each != explored[0] for each in explored):
+            raise ConfigError("score=training: contenders differ in epsilon, which is a part of it; use score=last")
         self.families = families(list(groups.values()), self.question)  # without seeds
         self._refuse_longer_runs()
 

@@ -285,6 +285,14 @@ def test_a_question_about_the_training_score_is_handed_on_with_its_window(asking
     assert asking("optimizer.lr=0.001,0.002", "window=25%").folder == asking("optimizer.lr=0.001,0.002").folder
 
 
+def test_contenders_that_explore_differently_are_refused_by_the_training_score_before_they_are_trained(
+    asking: Asking,
+) -> None:
+    asking("epsilon=constant", "epsilon.value=0.1,0.2")
+    with pytest.raises(ConfigError, match=r"^score=training: contenders differ in epsilon, .*; use score=last$"):
+        asking("epsilon=constant", "epsilon.value=0.1,0.2", "score=training")
+
+
 def test_the_same_question_is_the_same_decision_however_it_is_written(asking: Asking) -> None:
     one = asking("optimizer.lr=0.001,0.002", "budget.steps=1_000_000")
     again = asking("optimizer.lr=0.002,1e-3", "budget.steps=1000000", "threads=2", "tracking=mlflow")
