@@ -6,7 +6,7 @@ A field that is added leaves the version as it is; one that goes, or means somet
 from math import isfinite
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter
+from pydantic import BaseModel, BeforeValidator, Field, TypeAdapter
 
 Format = Literal["text", "json"]
 
@@ -17,17 +17,13 @@ Number = Annotated[
 Said = Literal["better", "worse", "equivalent", "not decided"]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-
-class Document(_Part):
+class Document(BaseModel):
     """What all documents have."""
 
     version: Literal[1] = 1
 
 
-class Question(_Part):
+class Question(BaseModel):
     """What was asked."""
 
     by: list[str] = Field(description="keys that tell groups apart; of a table of scores, group")
@@ -41,7 +37,7 @@ class Question(_Part):
     baseline: str | None
 
 
-class GroupScore(_Part):
+class GroupScore(BaseModel):
     """A group's score, or that of a key's value."""
 
     family: str = Field(description="the key, or all keys that differ")
@@ -52,7 +48,7 @@ class GroupScore(_Part):
     seeds: dict[int, float] = Field(description="score by seed")
 
 
-class PairVerdict(_Part):
+class PairVerdict(BaseModel):
     """What is known of one group's mean less another's."""
 
     family: str
@@ -65,7 +61,7 @@ class PairVerdict(_Part):
     seeds: int = Field(description="of each group at that look; 0 before the first")
 
 
-class Looks(_Part):
+class Looks(BaseModel):
     """The plan of a family, and where it stands."""
 
     family: str
@@ -91,7 +87,7 @@ class Compared(Document):
     looks: list[Looks]
 
 
-class Reported(_Part):
+class Reported(BaseModel):
     """A run and its last evaluation."""
 
     run: str
@@ -116,7 +112,7 @@ class Query(Document):
     config: dict[str, Any] = Field(description="the keys under env")
 
 
-class Trial(_Part):
+class Trial(BaseModel):
     """A contract that was tried."""
 
     component: str
@@ -125,7 +121,7 @@ class Trial(_Part):
     because: str = Field(description="why it is broken, else empty")
 
 
-class Cost(_Part):
+class Cost(BaseModel):
     """What a training costs on this machine."""
 
     component: str

@@ -57,14 +57,9 @@ class Comparison:
 
     def document(self, verb: Literal["compare", "decide"]) -> documents.Compared:
         """Return what is known, for programs."""
-        names = documents.GroupScore.model_fields.keys() - {"seeds"}
         seeds: dict[tuple[str, str], dict[int, float]] = defaultdict(dict)
         for row in self.tables["seeds"]:
             seeds[row["family"], row["group"]][row["seed"]] = row["score"]
-        scores = [
-            {name: row[name] for name in names} | {"seeds": seeds[row["family"], row["group"]]}
-            for row in self.tables["scores"]
-        ]
         looks = [
             documents.Looks(
                 family=each.family.name,
@@ -78,17 +73,20 @@ class Comparison:
         ]
         question = asdict(self.question) | {"by": self.by, "measure": self.measure}
         question["window"] = self.question.window if self.question.score == "training" else None
-        verdicts = [{key: value for key, value in row.items() if key != "detectable"} for row in self.tables["verdict"]]
+        verdicts = [documents.PairVerdict(**row) for row in self.tables["verdict"]]
         return documents.Compared(
             verb=verb,
             question=documents.Question(**question),
-            decided=bool(verdicts) and all(row["said"] != "not decided" for row in verdicts),
+            decided=bool(verdicts) and all(each.said != "not decided" for each in verdicts),
             verdict=self.verdict,
             others=self.others,
             caveats=self.caveats,
             notes=self.notes,
-            verdicts=[documents.PairVerdict(**row) for row in verdicts],
-            scores=[documents.GroupScore(**row) for row in scores],
+            verdicts=verdicts,
+            scores=[
+                documents.GroupScore(**row | {"seeds": seeds[row["family"], row["group"]]})
+                for row in self.tables["scores"]
+            ],
             looks=looks,
         )
 
