@@ -59,32 +59,30 @@ class Verb(Generic[T]):
             arguments = self.rewrite(list(typed))
             asked = self.asked(arguments, typed)
             flags = flags_of(arguments)
-            if flags.cfg:
-                print(shown(self.config_name or self.name, arguments), end="")
-                return
-            is_text = getattr(asked[0].config, "format", "text") == "text"
+            is_text = flags.cfg or getattr(asked[0].config, "format", "text") == "text"
             with nullcontext() if is_text else terminal.only_documents():
-                self._do(asked, arguments, flags.multirun)
+                if flags.cfg:
+                    print(shown(self.config_name or self.name, arguments), end="")
+                elif not flags.multirun:
+                    with terminal.working(f"{self.name}: loading"):
+                        call = self.work(asked[0])
+                    if interrupts.seen():
+                        raise KeyboardInterrupt
+                    call()
+                elif self.sweep is not None:
+                    self.sweep(asked, launcher(arguments), arguments)
+                elif not launcher(arguments).is_basic:
+                    raise ConfigError(
+                        f"hydra/launcher: runs trainings; {self.name} does one after the other, leave it out"
+                    )
+                else:
+                    in_turn(self.work, asked)
         except Fault as error:
             terminal.warn(str(error))
             sys.exit(error.exit_code)
         except OSError as error:
             terminal.warn(in_words(error))
             sys.exit(1)
-
-    def _do(self, asked: Sequence[Asked[T]], arguments: Sequence[str], is_sweep: bool) -> None:
-        if not is_sweep:
-            with terminal.working(f"{self.name}: loading"):
-                call = self.work(asked[0])
-            if interrupts.seen():
-                raise KeyboardInterrupt
-            call()
-        elif self.sweep is not None:
-            self.sweep(asked, launcher(arguments), arguments)
-        elif not launcher(arguments).is_basic:
-            raise ConfigError(f"hydra/launcher: runs trainings; {self.name} does one after the other, leave it out")
-        else:
-            in_turn(self.work, asked)
 
     def asked(self, arguments: Sequence[str], typed: Sequence[str] = ()) -> list[Asked[T]]:
         """Check every job that arguments ask for. Raises: ConfigError."""
