@@ -46,6 +46,17 @@ def check_time(key: str, text: str | int | None, example: str) -> None:
         raise ConfigError(f"{key}={text}: should be at most 10 years")
 
 
+def share(key: str, text: str | float) -> float:
+    """Return a share, which may be written in percent. Raises: ConfigError."""
+    try:
+        value = float(str(text).removesuffix("%")) / (100 if str(text).endswith("%") else 1)
+    except ValueError:
+        value = -1.0
+    if not 0 < value <= 1:
+        raise ConfigError(f"{key}={text}: write a share, as in {key}=20% or {key}=0.2")
+    return value
+
+
 def absolute(key: str, text: str) -> Path:
     """Return the path that a person typed, `~` filled in. Raises: ConfigError."""
     try:

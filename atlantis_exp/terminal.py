@@ -1,11 +1,12 @@
 """Texts on a terminal as they are, where a name with brackets is no markup; what is under way, and durations."""
 
+import os
 import shutil
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from io import TextIOWrapper
 from itertools import count
 from pathlib import Path
@@ -18,6 +19,7 @@ _HERE = Path(__file__).parent
 PROGRAM = "atlantis-exp" if (_HERE / "conf").is_dir() else "python -m atlantis_exp"
 """What a person calls: an installed wheel, which brings the config groups, by the name of its command."""
 LINE_SECONDS = 4.0  # before the first line of what is under way: nothing begins with five seconds of silence
+_documents: list[str] | None = None  # to be printed, while nothing else may be
 _FIRST_SECONDS = 1.0  # what takes less needs no line
 
 
@@ -70,6 +72,30 @@ def harmless(text: str) -> str:
 def warn(text: str) -> None:
     """Print one line on stderr."""
     print(f"atlantis_exp: {harmless(text)}".replace("\n", " "), file=sys.stderr, flush=True)
+
+
+@contextmanager
+def only_documents() -> Iterator[None]:
+    """Send to stderr all that this process and those it starts print, except documents."""
+    global _documents
+    sys.stdout.flush()
+    kept, _documents = os.dup(1), []
+    os.dup2(2, 1)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        texts, _documents = _documents, None
+        for text in texts:
+            console().print(text)
+
+
+def document(text: str) -> None:
+    """Have a verb's answer printed, one line of JSON, where documents are asked for."""
+    if _documents is not None:
+        _documents.append(text)
 
 
 def until_line(lines: int) -> float:

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -14,13 +15,14 @@ from atlantis_exp.sessions.job import command_line
 from atlantis_exp.sessions.launchers import Launcher
 
 T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
 
 
 @dataclass(frozen=True)
-class Asked(Generic[T]):
+class Asked(Generic[T_co]):
     """What a command line asks for, once: a checked config, and what was typed for it."""
 
-    config: T
+    config: T_co
     verb: str
     overrides: tuple[str, ...]  # of this job alone, where it is one of a sweep
     typed: tuple[str, ...] = ()  # all arguments, before they became overrides
@@ -59,19 +61,23 @@ class Verb(Generic[T]):
             flags = flags_of(arguments)
             if flags.multirun:
                 interrupts.hold()
-            if flags.cfg:
-                print(shown(self.config_name or self.name, arguments), end="")
-            elif not flags.multirun:
-                with terminal.working(f"{self.name}: loading"):
-                    call = self.work(asked[0])
-                interrupts.hold()
-                call()
-            elif self.sweep is not None:
-                self.sweep(asked, launcher(arguments), arguments)
-            elif not launcher(arguments).is_basic:
-                raise ConfigError(f"hydra/launcher: runs trainings; {self.name} does one after the other, leave it out")
-            else:
-                in_turn(self.work, asked)
+            is_text = flags.cfg or getattr(asked[0].config, "format", "text") == "text"
+            with nullcontext() if is_text else terminal.only_documents():
+                if flags.cfg:
+                    print(shown(self.config_name or self.name, arguments), end="")
+                elif not flags.multirun:
+                    with terminal.working(f"{self.name}: loading"):
+                        call = self.work(asked[0])
+                    interrupts.hold()
+                    call()
+                elif self.sweep is not None:
+                    self.sweep(asked, launcher(arguments), arguments)
+                elif not launcher(arguments).is_basic:
+                    raise ConfigError(
+                        f"hydra/launcher: runs trainings; {self.name} does one after the other, leave it out"
+                    )
+                else:
+                    in_turn(self.work, asked)
         except Fault as error:
             terminal.warn(str(error))
             sys.exit(error.exit_code)

@@ -2,12 +2,16 @@
 
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
+
+from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.jobs import job_of, training_of
 from atlantis_exp.components import KINDS
-from atlantis_exp.config import Config
+from atlantis_exp.config import STRICT, Config
+from atlantis_exp.documents import Format
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import replaced
 
@@ -21,22 +25,30 @@ _OURS = ("model=cnn", "model=resnet", "sampler=uniform", "objective=dqn")
 """The components that others of their kinds are measured beside."""
 
 
+@dataclass(config=STRICT, kw_only=True, frozen=True)
+class CheckConfig(Config):
+    """A training, whose components are tried."""
+
+    format: Format
+
+
 def _work(asked: Asked[Config]) -> Callable[[], None]:
     from atlantis_exp.sessions.contracts import check, trials
 
-    job = job_of(asked)
-    chosen = [text for text in asked.overrides if text.partition("=")[0] in KINDS]
+    overrides = tuple(text for text in asked.overrides if not text.startswith("format="))
+    job = job_of(replace(asked, overrides=overrides))
+    chosen = [text for text in overrides if text.partition("=")[0] in KINDS]
     kinds = [text.partition("=")[0] for text in chosen] or [*KINDS]
     measured = {}
     if references := [text for text in _OURS if text.partition("=")[0] in kinds]:
         measured["\n".join(chosen) or f"model={job.config.model.name}"] = job
         for text in references:
             kind = text.partition("=")[0]
-            own = [each for each in asked.overrides if not each.startswith(kind)]
+            own = [each for each in overrides if not each.startswith(kind)]
             with suppress(ConfigError):  # other settings may not go with it
                 measured.setdefault(text, training_of([*own, text]))
-    small = training_of(replaced([text for text in asked.overrides if not text.startswith("phase")], *_SMALL))
+    small = training_of(replaced([text for text in overrides if not text.startswith("phase")], *_SMALL))
     return partial(check, trials(job.config, small, kinds), measured)
 
 
-VERB = Verb("check", Config, _work)
+VERB = Verb("check", CheckConfig, _work)

@@ -2,16 +2,18 @@
 
 import re
 from collections.abc import Callable, Iterable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from atlantis_exp import terminal
+from atlantis_exp.checking import absolute, share
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.components import Probability
 from atlantis_exp.config import STRICT, PathsConfig, TrackingConfig
+from atlantis_exp.documents import Format
 from atlantis_exp.faults import ConfigError
 
 if TYPE_CHECKING:
@@ -26,16 +28,27 @@ class CompareConfig:
     runs: list[str]  # names, starts of names or patterns; none: all
     where: list[str]  # KEY=VALUE; none: all
     at_epsilon: Probability | None  # of the evaluations; null: each run's latest
+    score: Literal["last", "training"]
+    window: str | float  # of score=training, a share of the steps
+    scores: str | None  # a CSV file in place of runs
+    columns: list[str]  # group=NAME, seed=NAME, score=NAME, of that file
     baseline: str | None  # a value of one of the keys of by, or a group; null: all pairs
     delta: str | float | None  # a difference that does not matter: 5% of a score, or points
     seeds: Annotated[int, Field(ge=5, le=10_000)]  # a group, at the last look
     error: Annotated[float, Field(ge=1e-6, lt=1)]  # probability of any false verdict
     look: Literal["due", "now"]
+    format: Format
     tracking: TrackingConfig
     paths: PathsConfig
 
     def __post_init__(self) -> None:
         margin(self.delta)
+        share("window", self.window)
+        of_runs = {"by": self.by != ["model"], "score": self.score != "last", "at_epsilon": self.at_epsilon is not None}
+        of_runs |= {"runs": bool(self.runs), "where": bool(self.where)}
+        if self.scores is not None and (key := next((key for key, is_asked in of_runs.items() if is_asked), None)):
+            raise ConfigError(f"{key}: is of runs, not of scores={self.scores}, grouped by columns=group=NAME")
+        named(self.columns)
 
     @property
     def question(self) -> "Question":
@@ -43,7 +56,8 @@ class CompareConfig:
         from atlantis_exp.comparison.verdict import Question
 
         delta, relative = margin(self.delta)
-        return Question(tuple(self.by), self.seeds, self.error, delta, relative, self.baseline)
+        window = share("window", self.window)
+        return Question(tuple(self.by), self.seeds, self.error, delta, relative, self.baseline, self.score, window)
 
 
 def margin(delta: str | float | None) -> tuple[float | None, bool]:
@@ -60,10 +74,19 @@ def margin(delta: str | float | None) -> tuple[float | None, bool]:
     return value, text.endswith("%")
 
 
+def named(columns: Iterable[str]) -> dict[str, str]:
+    """Return the columns of a table of scores that have names of their own. Raises: ConfigError."""
+    names = dict(text.partition("=")[::2] for text in columns)
+    for key, name in names.items():
+        if key not in ("group", "seed", "score") or not name:
+            raise ConfigError(f"columns={key}={name}: write group=NAME, seed=NAME or score=NAME")
+    return names
+
+
 def list_out(arguments: list[str]) -> list[str]:
     """Let a list be written without brackets, as in `by=model,sampler`."""
     # Hydra itself would take the commas for a sweep, and a second `=` for a mistake.
-    return [re.sub(r"^(by|runs|where)=([^\[].*)$", listed, argument) for argument in as_texts(arguments)]
+    return [re.sub(r"^(by|runs|where|columns)=([^\[].*)$", listed, argument) for argument in as_texts(arguments)]
 
 
 def as_texts(arguments: Iterable[str]) -> list[str]:
@@ -78,11 +101,21 @@ def listed(match: re.Match[str]) -> str:
 
 
 def _work(asked: Asked[CompareConfig]) -> Callable[[], object]:
-    from atlantis_exp.sessions.comparing import Choice, compare
+    from atlantis_exp.sessions.comparing import Choice, compare, refuse_worse_commits
 
     config = asked.config
-    choice = Choice(Path(config.paths.outputs), config.runs, config.where, config.at_epsilon)
-    return partial(compare, config.question, choice, config.tracking, asked.command, look_now=config.look == "now")
+    scores = None if config.scores is None else absolute("scores", config.scores)
+    choice = Choice(
+        *(Path(config.paths.outputs), config.runs, config.where, config.at_epsilon), scores, named(config.columns)
+    )
+
+    def call() -> None:
+        now = config.look == "now"
+        comparison = compare(config.question, choice, config.tracking, asked.command, look_now=now)
+        terminal.document(comparison.document("compare").model_dump_json())
+        refuse_worse_commits(comparison, config.baseline)
+
+    return call
 
 
 VERB = Verb("compare", CompareConfig, _work, rewrite=list_out)

@@ -4,12 +4,13 @@ import dataclasses
 import re
 from collections.abc import Callable, Iterable
 from functools import cache, partial
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from hydra.core.override_parser.types import Glob
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from atlantis_exp.checking import share
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.compare import as_texts, listed, margin
 from atlantis_exp.commands.jobs import training_of
@@ -25,6 +26,7 @@ from atlantis_exp.commands.overrides import (
     with_first_values,
 )
 from atlantis_exp.config import FREE, STRICT, Config
+from atlantis_exp.documents import Format
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import command_line
 
@@ -37,14 +39,18 @@ class DecideConfig(Config):
     """A question about contenders, each a training of this config but for the keys that tell them apart."""
 
     against: list[str]  # overrides: with all of them, or with none
+    score: Literal["last", "training"]
+    window: str | float  # of score=training, a share of the steps
     baseline: str | None
     delta: str | Annotated[float, Field(gt=0)] | Annotated[int, Field(gt=0)] | None
     seeds: Annotated[int, Field(ge=5, le=1_000)]
     error: Annotated[float, Field(ge=1e-6, lt=1)]
+    format: Format
 
     def __post_init__(self) -> None:
         super().__post_init__()
         margin(self.delta)
+        share("window", self.window)
         if not self.evaluation.at_end:
             raise ConfigError("evaluation.at_end=false: contenders are compared by the evaluation at their end")
 
@@ -125,7 +131,10 @@ def contest_of(asked: Asked[DecideConfig]) -> "Contest":
     delta, relative = margin(config.delta)
     keys = tuple(override.key_or_group for override in overrides)
     return Contest(
-        Question(keys, config.seeds, config.error, delta, relative, config.baseline),
+        Question(
+            *(keys, config.seeds, config.error, delta, relative, config.baseline),
+            *(config.score, share("window", config.window)),
+        ),
         contenders,
         several=several,
         fixed=fixed,

@@ -7,6 +7,7 @@ from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.config import STRICT, Env
+from atlantis_exp.documents import Format
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -14,6 +15,7 @@ class QueryConfig:
     """The environment query of report figures 1.1 to 1.3."""
 
     env: Env
+    format: Format
 
 
 def _work(asked: Asked[QueryConfig]) -> Callable[[], None]:

@@ -9,6 +9,7 @@ from pydantic.dataclasses import dataclass
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.compare import list_out
 from atlantis_exp.config import STRICT, PathsConfig
+from atlantis_exp.documents import Format
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -17,6 +18,7 @@ class ReportConfig:
 
     runs: list[str]  # names, starts of names or patterns; none: all
     where: list[str]  # KEY=VALUE; none: all
+    format: Format
     paths: PathsConfig
 
 

@@ -91,6 +91,8 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
             "rates: " + _said(groups, tables["why"], "points_per_1000_frames"),
             1.6 + 0.6 * len(groups),
         )
+    if not tables["evaluation"]:
+        return drawn
     medians = f"; medians: {_said(groups, tables['evaluation'], 'median')}"
     if any(row["episodes"] < _FEW for row in tables["evaluation"]):
         distribution = (_strips, "One dot an evaluated episode", row_height)

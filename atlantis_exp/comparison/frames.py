@@ -6,11 +6,13 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from atlantis_exp.checking import share
 from atlantis_exp.comparison.choosing import select
+from atlantis_exp.comparison.estimands import score_of
 from atlantis_exp.comparison.gather import (
     NOT_STARTED,
     PUT_ASIDE,
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 
 _TAGS_LEFT_OUT = ("mlflow.", "atlantis.", "group")  # beginnings of tags that are columns of their own
-_RUN = ("run", "title", "kind", "group", "state", "error", "started", "updated")
+_RUN = ("run", "title", "kind", "group", "state", "error", "started", "updated", "score")
 _EVALUATION = (
     *("run", "step", "source", "folder", "final", "epsilon", "evaluation_seed", "episodes"),
     *("mean", "standard_error", "median", "iqm", "lower_quartile", "upper_quartile", "low", "high"),
@@ -51,7 +53,8 @@ _POINT = ("run", "step", "frames", "hours", "flops")
 class Runs:
     """What run folders hold, as pandas data frames that share the column `run`.
 
-    runs: a row a run: config leaves by their dotted keys, the result's numbers, tags as `tag.NAME`.
+    runs: a row a run: what it counts by in a comparison, config leaves by their dotted keys, the result's numbers, tags
+        as `tag.NAME`.
     evaluations: a row an evaluation; scores in points.
     episodes: a row an evaluated episode; scores in points, lengths in steps and emulator frames.
     curves: a row a value of a training's curve, with `frames` (emulator frames of training), `hours` and `flops`
@@ -82,6 +85,8 @@ def load_runs(
     runs: str | Sequence[str] = (),
     where: str | Sequence[str] = (),
     points: int | None = 500,
+    score: Literal["last", "training"] = "last",
+    window: str | float = 0.2,
 ) -> Runs:
     """Read the runs under `outputs` from their folders, including those that still go on.
 
@@ -95,11 +100,16 @@ def load_runs(
             its commas.
         points: about how many points of a long curve are read, evenly spaced, including the first and the last; None
             means all.
+        score: what a finished training counts by, as `compare score=` takes it: the column `score` of the runs.
+        window: of score="training", the share of the steps, the last ones, as a number or a text such as "20%".
 
     Raises:
-        ConfigError: if there is no such folder, or no run has a key of `where`.
-        ValueError: if points is below one.
+        ConfigError: if there is no such folder, no run has a key of `where`, or the window is not a share.
+        ValueError: if points is below one, or there is no such score.
     """
+    if score not in ("last", "training"):
+        raise ValueError(f"score={score}: should be last or training")
+    end = share("window", window)
     if points is not None and points < 1:
         raise ValueError(f"points={points}: should be at least 1, or None for all")
     outputs = Path(outputs)
@@ -110,13 +120,25 @@ def load_runs(
     read = list[_Frames]()
     for run in select([run for run in stored.runs if fits(run.name, patterns)], _listed(where)):
         try:
-            read.append(_read(run, sys.maxsize if points is None else points, skipped))
+            frames = _read(run, sys.maxsize if points is None else points, skipped)
+            if score == "training" and run.trained is not None and run.folder.final_result is not None:
+                frames.row["score"] = _training_score(run, end)
+            read.append(frames)
         except UNREADABLE as error:
             skipped[run.name] = f"broken: {error}"
     for name, reason in skipped.items():
         if reason not in (PUT_ASIDE, NOT_STARTED):
             warnings.warn(f"left out {name}: {reason}", stacklevel=2)
     return _assemble(read, skipped)
+
+
+def _training_score(run: StoredRun, window: float) -> float:
+    """Return the training score, NaN with a warning if there is none."""
+    try:
+        return score_of(run.folder, window)
+    except (ValueError, OSError) as error:
+        warnings.warn(f"{run.name} has no training score: {error}", stacklevel=3)
+        return float("nan")
 
 
 def _listed(texts: str | Sequence[str]) -> list[str]:
@@ -159,6 +181,8 @@ def _read(run: StoredRun, points: int, skipped: dict[str, str]) -> _Frames:
         }
         final = result is not None and each.step == result.steps
         evaluations.append({**place, "final": final, **_evaluation(each, table)})
+        if final and run.trained:
+            row["score"] = evaluations[-1]["iqm"]
         episodes.append(_episodes(place, table))
     return _Frames(row, evaluations, episodes, _curve(run, points) if run.trained else None)
 

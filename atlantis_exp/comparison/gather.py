@@ -22,6 +22,7 @@ from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.facts import read_facts, read_tags
 from atlantis_exp.runs.folder import BEST_EPISODE, EVALUATION, RESULT, RunFolder
 from atlantis_exp.runs.journal import curve
+from atlantis_exp.statistics import interquartile_mean
 
 Array = npt.NDArray[np.float64]
 
@@ -101,6 +102,12 @@ class Training(Run):
     episodes: EpisodeTable
     policy: str = ""  # what the network did most in these episodes, in words; empty if not recorded
     film: Path | None = None  # of one of these episodes
+    training_score: float | None = None  # which it counts by in place of the evaluation's, if it is asked for
+
+    @property
+    def score(self) -> float:
+        """What it counts by."""
+        return interquartile_mean(self.episodes.scores) if self.training_score is None else self.training_score
 
     @property
     def has_collapsed(self) -> bool:

@@ -11,7 +11,8 @@ from atlantis_exp.comparison.choosing import COMMIT, resolve, values_in
 from atlantis_exp.comparison.decision import condition, equal_scores, modes, size_found
 from atlantis_exp.comparison.gather import AXES, StoredRun, Training
 from atlantis_exp.comparison.published import Table, early_dqn, random_line
-from atlantis_exp.comparison.verdict import Answer, group_of
+from atlantis_exp.comparison.verdict import Answer, Group, Question
+from atlantis_exp.comparison.words import measure
 from atlantis_exp.components import Component, facts_of
 from atlantis_exp.runs.folder import LOST
 from atlantis_exp.terminal import PROGRAM
@@ -26,10 +27,16 @@ class Facts:
     game: Component | None
     groups: Mapping[str, Sequence[Training]]
     lost: Sequence[StoredRun]  # runs that should have been in the groups
-    by: Sequence[str]
+    question: Question
+    scored: Sequence[Group]
     answers: Sequence[Answer]
     tables: Mapping[str, Table]
     frames: float  # of the longest training
+
+    @property
+    def by(self) -> Sequence[str]:
+        """The keys that tell the groups apart."""
+        return self.question.by
 
     @property
     def trainings(self) -> list[Training]:
@@ -38,6 +45,12 @@ class Facts:
 
 
 Note = Callable[[Facts], Iterator[str]]
+
+
+def by_training(facts: Facts) -> Iterator[str]:
+    """Say what a training score is."""
+    if facts.question.score == "training":
+        yield f"The score is {measure(facts.question)}."
 
 
 def conditions(facts: Facts) -> Iterator[str]:
@@ -95,13 +108,18 @@ def equal(facts: Facts) -> Iterator[str]:
 
 def modes_found(facts: Facts) -> Iterator[str]:
     """Describe seeds that fall into two modes: their mean is no score of either."""
-    for row in facts.tables["evaluation"]:
-        scores = group_of(facts.groups[row["group"]], facts.by).seeds
-        if (found := modes(list(scores.values()))) is not None:
+    played = {row["group"]: row for row in facts.tables["evaluation"]}
+    for group in facts.scored:
+        if (found := modes(list(group.seeds.values()))) is not None:
+            row = played.get(group.label)
             yield (
-                f"{row['group']} falls into two modes: {found.share:.0%} of its seeds score {found.upper:,.0f} on "
-                f"average, the others {found.lower:,.0f}; {row['time_cap_share']:.0%} of its episodes reach the time "
-                f"cap, at {row['points_per_frame']:.3g} points per frame."
+                f"{group.label} falls into two modes: {found.share:.0%} of its seeds score {found.upper:,.0f} on "
+                f"average, the others {found.lower:,.0f}"
+            ) + (
+                f"; {row['time_cap_share']:.0%} of its episodes reach the time cap, at {row['points_per_frame']:.3g} "
+                "points per frame."
+                if row
+                else "."
             )
 
 
@@ -298,7 +316,7 @@ def random_player(facts: Facts) -> Iterator[str]:
 
 
 CAVEATS: Sequence[Note] = (
-    *(conditions, collapsed, lost_seeds, equal, modes_found, unlike, lossy, uncommitted),
+    *(by_training, conditions, collapsed, lost_seeds, equal, modes_found, unlike, lossy, uncommitted),
     *(unbalanced, later_seeds, moved_seeds),
 )
 """What may make a verdict mean something else."""

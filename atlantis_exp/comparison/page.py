@@ -48,8 +48,6 @@ COLUMNS: Mapping[str, Sequence[str]] = {
 """The tables that the page shows, and their columns."""
 
 _TITLES = {
-    ("scores", "score"): "mean of IQMs",
-    ("runs", "score"): "IQM",
     ("references", "score"): "mean score",
     ("why", "mean"): "mean score",
     ("views", "other"): "other",

@@ -2,14 +2,17 @@
 
 import csv
 import io
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import combinations
 from math import isnan
+from typing import Literal
 
 import numpy as np
 
+from atlantis_exp import documents
 from atlantis_exp.comparison.choosing import plays_alike
 from atlantis_exp.comparison.decision import (
     FEWEST_SEEDS,
@@ -23,8 +26,8 @@ from atlantis_exp.comparison.decision import (
 from atlantis_exp.comparison.gather import AXES, Array, Gathered, Player, Training
 from atlantis_exp.comparison.notes import CAVEATS, NOTES, Facts
 from atlantis_exp.comparison.published import Row, Table, curves, scores
-from atlantis_exp.comparison.verdict import Answer, Question, answer, families, group_of, one_a_seed
-from atlantis_exp.comparison.words import said
+from atlantis_exp.comparison.verdict import Answer, Group, Question, answer, families, group_of, one_a_seed
+from atlantis_exp.comparison.words import measure, said
 from atlantis_exp.components import facts_of, title_of
 from atlantis_exp.games import Game
 from atlantis_exp.statistics import Scores, human_normalised, probability_of_improvement, summarize
@@ -39,16 +42,53 @@ _NAN = float("nan")
 class Comparison:
     """A comparison of groups of runs, as it is printed and drawn."""
 
-    title: str  # of the game
+    title: str  # of the game; empty if it is not known
     game: Game
     groups: list[str]
     by: list[str]
+    question: Question
+    measure: str  # what a seed's score is
     answers: list[Answer]
     verdict: str  # the answer by the first key
     others: list[str]  # the answers by the other keys
     caveats: list[str]  # what may make the verdict mean something else
     notes: list[str]
     tables: dict[str, Table]
+
+    def document(self, verb: Literal["compare", "decide"]) -> documents.Compared:
+        """Return what is known, for programs."""
+        seeds: dict[tuple[str, str], dict[int, float]] = defaultdict(dict)
+        for row in self.tables["seeds"]:
+            seeds[row["family"], row["group"]][row["seed"]] = row["score"]
+        looks = [
+            documents.Looks(
+                family=each.family.name,
+                planned=list(each.family.plan.looks),
+                taken=[look.size for look in each.decision.looks],
+                next=each.decision.next_look,
+                error=each.family.plan.error,
+                spent=each.decision.spent,
+            )
+            for each in self.answers
+        ]
+        question = asdict(self.question) | {"by": self.by, "measure": self.measure}
+        question["window"] = self.question.window if self.question.score == "training" else None
+        verdicts = [documents.PairVerdict(**row) for row in self.tables["verdict"]]
+        return documents.Compared(
+            verb=verb,
+            question=documents.Question(**question),
+            decided=bool(verdicts) and all(each.said != "not decided" for each in verdicts),
+            verdict=self.verdict,
+            others=self.others,
+            caveats=self.caveats,
+            notes=self.notes,
+            verdicts=verdicts,
+            scores=[
+                documents.GroupScore(**row | {"seeds": seeds[row["family"], row["group"]]})
+                for row in self.tables["scores"]
+            ],
+            looks=looks,
+        )
 
 
 def compare(
@@ -57,19 +97,21 @@ def compare(
     question: Question,
     record: Mapping[str, Sequence[Look]] | None = None,
     now: bool = False,
+    scored: Sequence[Group] = (),
 ) -> Comparison:
     """Compare groups of trainings, taking the looks that are due, or with `now` one that is not.
 
     Args:
         record: the looks taken before, by family.
+        scored: groups of seeds that have scores and nothing else, in place of trainings.
 
     Raises:
         ConfigError: if the baseline is not among what is compared.
     """
-    seeds_of = [group_of(runs, question.by) for runs in groups.values()]
+    seeds_of = scored or [group_of(runs, question.by) for runs in groups.values()]
     answers = answer(families(seeds_of, question), record or {}, now)
     trainings = [training for runs in groups.values() for training in runs]
-    component = trainings[0].game
+    component = trainings[0].game if trainings else None
     game = facts_of(component)
     frames = max((float(training.curve["frames"][-1]) for training in trainings if training.curve), default=0.0)
     by_label = {group.label: group.seeds for group in seeds_of}
@@ -106,13 +148,14 @@ def compare(
         "published_curves": [row for row in curves(component) if row["frames"] <= frames],
         "skipped": [{"run": name, "reason": reason} for name, reason in gathered.skipped.items()],
     }
-    facts = Facts(component, groups, gathered.lost, question.by, answers, tables, frames)
+    facts = Facts(component, groups, gathered.lost, question, seeds_of, answers, tables, frames)
     caveats, notes = ([line for note in each for line in note(facts)] for each in (CAVEATS, NOTES))
     if now and answers and all(each.taken is None for each in answers):
         caveats.append("look=now took no look: no undecided group has new seeds, or one has fewer than five.")
-    verdict, *others = _sentences(answers, list(groups))
-    title = title_of(trainings[0].config["env.id"])
-    return Comparison(title, game, list(groups), list(question.by), answers, verdict, others, caveats, notes, tables)
+    verdict, *others = _sentences(answers, list(by_label), question)
+    title = title_of(trainings[0].config["env.id"]) if trainings else ""
+    asked = list(by_label), list(question.by), question, measure(question)
+    return Comparison(title, game, *asked, answers, verdict, others, caveats, notes, tables)
 
 
 def to_csv(table: Table) -> str:
@@ -125,12 +168,16 @@ def to_csv(table: Table) -> str:
     return text.getvalue()
 
 
-def _sentences(answers: Sequence[Answer], groups: Sequence[str]) -> list[str]:
+def _sentences(answers: Sequence[Answer], groups: Sequence[str], question: Question) -> list[str]:
     if not answers:
         return [f"There is one group only ({groups[0]}), so there is nothing to compare; by=KEY splits it."]
-    if len(answers) == 1:
-        return [said(answers[0])]
-    return [f"By {each.family.name}: {said(each)}" for each in answers]
+    way = "" if question.score != "training" else f"by score=training window={100 * question.window:g}%"
+    keys = [f"by {each.family.name}" if len(answers) > 1 else "" for each in answers]
+    ways = [", ".join(filter(None, (way, key))) for key in keys]
+    return [
+        f"{way[0].upper()}{way[1:]}: {said(each)}" if way else said(each)
+        for way, each in zip(ways, answers, strict=True)
+    ]
 
 
 def _scores(family: str, values: Mapping[str, Mapping[int, float]], answer: Answer | None) -> Table:
@@ -242,7 +289,7 @@ def _runs(label: str, runs: Sequence[Training]) -> Table:
                 **{axis: training.curve[axis][-1] if axis in training.curve else "" for axis in AXES},
                 "epsilon": training.config["evaluation.epsilon"],
                 "episodes": summary.episodes,
-                "score": summary.interquartile_mean,
+                "score": training.score,
                 "mean": summary.mean,
                 "median": summary.median,
                 "low": summary.low,
@@ -304,6 +351,8 @@ def _at(training: Training, axis: str, x: float | Array, measure: str = "score")
 
 def _profile(groups: Groups, game: Game) -> Table:
     """Return the share of episodes that score more than tau (Agarwal et al. 2021), for tau over all scores."""
+    if not groups:
+        return []
     scores = np.concatenate([_pooled(runs) for runs in groups.values()])
     if game.is_logarithmic:
         least = game.score_range[0] / 10

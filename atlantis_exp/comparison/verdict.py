@@ -1,15 +1,15 @@
 """Turn a question about groups of runs into families of pairs, and decide each.
 
-A seed's *score* is the interquartile mean of its evaluated episodes; a group's score is the mean over its seeds. No
-other quantity is decided about. `families` says what is compared with what, `answer` takes the looks that are due, and
-`wanted` returns the seeds that the next looks need.
+A seed's *score* is what `Question.score` says, a group's the mean over its seeds. No other quantity is decided about.
+`families` says what is compared with what, `answer` takes the looks that are due, and `wanted` returns the seeds that
+the next looks need.
 """
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import count, islice
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from atlantis_exp.comparison.choosing import COMMIT, values_in
 from atlantis_exp.comparison.decision import Decision, Look, Plan, decide, looks_up_to
 from atlantis_exp.comparison.gather import Training
 from atlantis_exp.faults import ConfigError
-from atlantis_exp.statistics import interquartile_mean
 
 _SHORTEST_COMMIT = 4  # digits of a commit's name, as git itself wants them
 
@@ -33,6 +32,14 @@ class Question:
     delta: float | None = None  # a difference that does not matter
     relative: bool = False  # whether delta is a share of a score
     baseline: str | None = None  # a value of one of the keys, or a group
+    score: Literal["last", "training", "file"] = "last"  # `words.measure` says what each is
+    window: float = 0.2  # the share of the steps, the last ones, that score=training is about
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What makes it this question; without the score if it is the evaluation's, as in comparisons before others."""
+        unused = {"last": {"score", "window"}, "training": set[str](), "file": {"window"}}[self.score]
+        return {key: value for key, value in asdict(self).items() if key not in unused}
 
 
 @dataclass(frozen=True)
@@ -77,12 +84,12 @@ def one_a_seed(runs: Sequence[Training], value: Callable[[Training], Any]) -> di
 
 
 def group_of(runs: Sequence[Training], by: Sequence[str]) -> Group:
-    """Return a group with one score a seed: the interquartile mean of the seed's evaluated episodes.
+    """Return a group with one score a seed.
 
     Seeds that play equal games, as those that collapsed alike do, count like any other: to train others in their place
     would choose among the seeds by their scores.
     """
-    scores = one_a_seed(runs, lambda run: interquartile_mean(run.episodes.scores))
+    scores = one_a_seed(runs, lambda run: run.score)
     return Group(values_in(runs[0].facts, by), {seed: float(score) for seed, score in scores.items()})
 
 

@@ -6,10 +6,25 @@ from collections.abc import Sequence
 import numpy as np
 
 from atlantis_exp.comparison.decision import Plan, Verdict
-from atlantis_exp.comparison.verdict import Answer
+from atlantis_exp.comparison.verdict import Answer, Question
 
 _IN_FULL = 3  # pairs of a family, up to which each is said with its interval
 _LISTED = 6  # undecided pairs, up to which they are named
+
+
+def measure(question: Question) -> str:
+    """Say what a seed's score is."""
+    match question.score:
+        case "last":
+            return "the interquartile mean (IQM) of the seed's evaluated episodes after its last step"
+        case "training":
+            return (
+                f"the seed's points in the last {100 * question.window:g}% of its training over the episodes that "
+                "ended there: with the training's epsilon and latest weights, so it measures the process of learning, "
+                "not the network one keeps"
+            )
+        case _:
+            return "the mean of the seed's rows in a table"
 
 
 def said(answer: Answer) -> str:

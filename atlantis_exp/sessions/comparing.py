@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import strftime
 from typing import Any
@@ -23,6 +23,8 @@ from atlantis_exp.comparison.choosing import (
     select,
     shortened,
 )
+from atlantis_exp.comparison.elsewhere import read_scores
+from atlantis_exp.comparison.estimands import by_training
 from atlantis_exp.comparison.export_tables import to_latex, with_units
 from atlantis_exp.comparison.figures import Drawn, draw
 from atlantis_exp.comparison.gather import Gathered, Player, Training, gather, refuse_unknown
@@ -50,6 +52,8 @@ class Choice:
     runs: Sequence[str] = ()  # names, starts of names, patterns or a decision's name; none: all
     where: Sequence[str] = ()  # KEY=VALUE
     at_epsilon: float | None = None  # of the evaluations; None: each run's latest
+    scores: Path | None = None  # a table of the scores of seeds that were trained elsewhere, in place of runs
+    columns: Mapping[str, str] = field(default_factory=dict)  # of that table: group, seed or score to its name
 
 
 def compare(
@@ -61,25 +65,36 @@ def compare(
 
     Raises:
         ConfigError: if there is nothing to compare, the runs' protocols differ, or no group is the baseline.
-        Fault: if commits are compared with a baseline and another one is worse.
     """
     outputs = choice.outputs
-    gathered = _gather(choice, put_aside=COMMIT in question.by)
+    if choice.scores is None:
+        gathered = _gather(choice, put_aside=COMMIT in question.by)
+        refuse_mixed_protocols(gathered.trainings, question.by)
+        if question.score == "training":
+            gathered = replace(gathered, trainings=by_training(gathered.trainings, outputs, question.window))
+        question = replace(question, by=shortened(question.by, gathered.trainings[0].facts))
+        groups = group(gathered.trainings, question.by)
+        scored = [group_of(members, question.by) for members in groups.values()]
+        of: dict[str, Any] = {"groups": [[label, *_recipes(members)] for label, members in groups.items()]}
+        compared = f"{len(gathered.trainings)} under {outputs / 'runs'}"
+    else:
+        question, gathered, groups = replace(question, by=("group",), score="file"), Gathered(), {}
+        scored = read_scores(choice.scores, choice.columns)
+        path = str(choice.scores.resolve())
+        of = {"groups": [each.label for each in scored], "scores": path, "columns": dict(choice.columns)}
+        compared = f"{sum(len(each.seeds) for each in scored)} seeds in {path}"
     trainings = gathered.trainings
-    refuse_mixed_protocols(trainings, question.by)
-    question = replace(question, by=shortened(question.by, trainings[0].facts))
-    groups = group(trainings, question.by)
-    asked = families([group_of(members, question.by) for members in groups.values()], question)
+    asked = families(scored, question)
     identity = {
-        **asdict(question),
+        **question.identity,
         "by": list(question.by),
         "runs": sorted({*choice.runs}),
         "where": sorted({*choice.where}),
         "at_epsilon": choice.at_epsilon,
         "baseline": next((each.plan.baseline for each in asked if each.plan.baseline is not None), None),
-        "groups": [[label, *_recipes(members)] for label, members in groups.items()],
+        **of,
     }
-    folder = RunFolder(outputs / "comparisons" / f"{_slug(list(groups))}-{digest(identity)}")
+    folder = RunFolder(outputs / "comparisons" / f"{_slug([each.label for each in scored])}-{digest(identity)}")
     labels = {
         "mlflow.runName": folder.name,
         "mlflow.runColor": run_colour("comparison"),
@@ -88,20 +103,24 @@ def compare(
     with folder.held():
         record = read_looks(folder.path, asked)
         with terminal.working("computing the tables"):
-            comparison = tables.compare(gathered, groups, question, record, look_now)
+            comparison = tables.compare(gathered, groups, question, record, look_now, scored)
         write_looks(folder.path, comparison.answers)
         with terminal.working("drawing the figures"):
             figures = draw(comparison)
         with publishing(folder, tracking, outputs, labels) as journal:
             folder.write_config(facts := {**identity, "compared": [training.name for training in trainings]})
             journal.params({key: str(value) for key, value in flatten(facts).items()})
-            _write(journal, comparison, figures, provenance(command), f"{len(trainings)} under {outputs / 'runs'}")
+            _write(journal, comparison, figures, provenance(command), compared)
     _print(comparison)
     _print_film([*trainings, *(player for player in gathered.players if plays_alike(player, trainings))])
     print(f"{how_to_open(outputs)}\n{folder.artifact(_PAGE)}")
-    if COMMIT in question.by and (worse := worse_than_baseline(comparison.answers, question.by)):
-        raise Fault(f"worse than the baseline {question.baseline}: {'; '.join(worse)}")
     return comparison
+
+
+def refuse_worse_commits(comparison: Comparison, baseline: str | None) -> None:
+    """Raise Fault if commits were compared with a baseline and another one is worse."""
+    if COMMIT in comparison.by and (worse := worse_than_baseline(comparison.answers, comparison.by)):
+        raise Fault(f"worse than the baseline {baseline}: {'; '.join(worse)}")
 
 
 def _gather(choice: Choice, put_aside: bool) -> Gathered:
@@ -170,9 +189,11 @@ def _metrics(comparison: Comparison) -> dict[str, float]:
 
 def _print(comparison: Comparison) -> None:
     console = terminal.console(least=160)
-    for name, title in (("scores", "scores"), ("evaluation", "episodes")):
+    for name, title in (("scores", "scores"), ("evaluation", "episodes after the last step")):
+        if not comparison.tables[name]:
+            continue
         header, *rows = plain(name, comparison.tables[name])
-        table = Table(*header, title=f"{title} after the last step, by {', '.join(comparison.by)}")
+        table = Table(*header, title=f"{title} by {', '.join(comparison.by)}")
         for column in table.columns[1:]:
             column.justify = "right"
         for row in rows:
@@ -191,8 +212,8 @@ def _print(comparison: Comparison) -> None:
 
 def _print_film(played: Sequence[Training | Player]) -> None:
     """Say where the highest score can be seen, if it was filmed."""
-    best = max(played, key=lambda each: each.episodes.scores.max())
-    if best.film is not None and best.film.exists():
+    best = max(played, key=lambda each: each.episodes.scores.max(), default=None)
+    if best is not None and best.film is not None and best.film.exists():
         print(f"\nthe highest score, {best.episodes.scores.max():,.0f}, as a film: {best.film}")
 
 

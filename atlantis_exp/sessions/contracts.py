@@ -3,7 +3,7 @@
 import copy
 import random
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ import torch
 from rich.table import Table
 from torch import nn
 
-from atlantis_exp import terminal
+from atlantis_exp import documents, terminal
 from atlantis_exp.build import build_component, build_trainer, import_components, make_emulator
 from atlantis_exp.config import Config, SamplerConfig
 from atlantis_exp.faults import Fault
@@ -53,24 +53,30 @@ def check(trials: Iterator[Trial], measured: Mapping[str, Job]) -> None:
     Raises:
         Fault: where a contract is broken.
     """
-    table, broken = Table("component", "contract", "", "because"), []
+    tried = list[documents.Trial]()
     for part, contract, trial in trials:
+        because = ""
         try:
             with terminal.working(f"{part}: {contract}"):
                 trial()
-            table.add_row(part, contract, "kept", "")
         except Exception as error:
-            broken.append(f"{part}: {contract}")
-            reason = next((line for line in str(error).splitlines() if line.strip()), "")
             kind = "" if isinstance(error, Fault) else f"{type(error).__name__}: "
-            table.add_row(part, contract, "BROKEN", kind + reason)
+            because = kind + next((line for line in str(error).splitlines() if line.strip()), "")
+            because = because or "no reason given"
+        tried.append(documents.Trial(component=part, contract=contract, kept=not because, because=because))
+    table = Table("component", "contract", "", "because")
+    for each in tried:
+        table.add_row(each.component, each.contract, "kept" if each.kept else "BROKEN", each.because)
     terminal.console(least=120).print(table)
-    if broken:
-        raise Fault(f"broken: {', '.join(broken)}")
-    if measured:
+    broken = [f"{each.component}: {each.contract}" for each in tried if not each.kept]
+    costs = list[documents.Cost]()
+    if measured and not broken:
         with terminal.working("measuring costs"):
             costs = _costs(measured)
-        terminal.console(least=120).print(costs)
+        terminal.console(least=120).print(_table(costs))
+    terminal.document(documents.Check(trials=tried, costs=costs).model_dump_json())
+    if broken:
+        raise Fault(f"broken: {', '.join(broken)}")
 
 
 def trials(config: Config, small: Job, kinds: Collection[str]) -> Iterator[Trial]:
@@ -287,11 +293,9 @@ def _resumes(small: Job) -> None:
     _hold(whole == killed, f"{', '.join(part for part in whole if whole[part] != killed[part])} differ")
 
 
-def _costs(jobs: Mapping[str, Job]) -> Table:
+def _costs(jobs: Mapping[str, Job]) -> list[documents.Cost]:
     """Measure trainings on this machine; an update includes drawing its batch."""
-    table = Table("component", "pixels", "parameters", "FLOPs a sample", "updates/s", "steps/s")
-    for column in table.columns[1:]:
-        column.justify = "right"
+    costs = []
     for name, job in jobs.items():
         config = job.config
         set_up_torch(config, config.device)
@@ -301,7 +305,25 @@ def _costs(jobs: Mapping[str, Job]) -> Table:
             with trainer.emulators:
                 speed = expected(trainer, config, Counters())
         size, batch = config.env.size, config.training.batch_size
-        flops = trainer.learner.update_flops((config.env.stack, size, size), batch) / batch
-        counts = f"{count_parameters(trainer.learner.network):,}", f"{flops / 1e6:,.0f} M"
-        table.add_row(name, str(size), *counts, f"{speed.updates_per_second:,.1f}", f"{speed.steps_per_second:,.0f}")
+        costs.append(
+            documents.Cost(
+                component=name,
+                pixels=size,
+                parameters=count_parameters(trainer.learner.network),
+                flops_per_sample=trainer.learner.update_flops((config.env.stack, size, size), batch) / batch,
+                updates_per_second=speed.updates_per_second,
+                steps_per_second=speed.steps_per_second,
+            )
+        )
+    return costs
+
+
+def _table(costs: Sequence[documents.Cost]) -> Table:
+    table = Table("component", "pixels", "parameters", "FLOPs a sample", "updates/s", "steps/s")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for each in costs:
+        counts = f"{each.parameters:,}", f"{each.flops_per_sample / 1e6:,.0f} M"
+        speeds = f"{each.updates_per_second:,.1f}", f"{each.steps_per_second:,.0f}"
+        table.add_row(each.component, str(each.pixels), *counts, *speeds)
     return table

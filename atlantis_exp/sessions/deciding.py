@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from math import sqrt
@@ -21,6 +22,7 @@ from atlantis_exp.build import build_trainer
 from atlantis_exp.checking import digest, flatten, to_dict
 from atlantis_exp.comparison.choosing import mixed_protocol, resolve, shortened, values_in
 from atlantis_exp.comparison.decision import detectable, equivalence, looks_up_to
+from atlantis_exp.comparison.estimands import score_of
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.comparison.tables import Comparison
 from atlantis_exp.comparison.verdict import Group, Question, families, wanted
@@ -89,6 +91,11 @@ class Contest:
             self.contenders[label] = (each, job)
         if mixed := mixed_protocol({groups[each].label: facts[each] for each in chosen}, by):
             raise ConfigError(f"{mixed[1]}; give that key itself several values, or train them under one protocol")
+        explored = [
+            {key: value for key, value in each.items() if key.startswith("epsilon.")} for each in facts.values()
+        ]
+        if question.score == "training" and any(each != explored[0] for each in explored):
+            raise ConfigError("score=training: contenders differ in epsilon, which is a part of it; use score=last")
         self.families = families(list(groups.values()), self.question)  # without seeds
         self._refuse_longer_runs()
 
@@ -106,7 +113,7 @@ class Contest:
     def folder(self) -> RunFolder:
         """Where the decision has its page: the same question of the same trainings is the same decision."""
         identity = {
-            **vars(self.question),
+            **self.question.identity,
             "runs": sorted(folder.name for folder in self.runs),
             "budget.steps": self.config.budget.steps,
             "evaluation.epsilon": self.config.evaluation.epsilon,
@@ -135,6 +142,7 @@ class Contest:
             f"at_epsilon={self.config.evaluation.epsilon}",
             *([f"delta={delta}"] if delta else []),
             *([f"baseline={quoted(question.baseline)}"] if question.baseline is not None else []),
+            *(["score=training", f"window={question.window:.12g}"] if question.score == "training" else []),
             *([f"error={question.error}"] if question.error != Question.error else []),
             f"paths.outputs={quoted(str(self.outputs))}",
         )
@@ -246,6 +254,8 @@ def decide(contest: Contest, train: Callable[[Job], int | None] = train) -> None
         terminal.warn(again)
         sys.exit(ended.code if isinstance(ended, SystemExit) else 130)
     print(f"its runs again: {contest.comparing}")
+    if comparison is not None:
+        terminal.document(comparison.document("decide").model_dump_json())
 
 
 def _train(contest: Contest, needed: Mapping[str, Sequence[int]], train: Callable[[Job], int | None]) -> None:
@@ -317,10 +327,17 @@ def _spread(contest: Contest) -> tuple[float, str] | None:
     """Return the standard deviation over seeds as a share of the score, and its source; None if it is unknown."""
     shares = []
     for label in contest.contenders:
-        ended = [contest.run(label, seed).result for seed in range(contest.looks[-1])]
-        scores = [
-            result.evaluation["evaluation/interquartile_mean"] for result in ended if result and result.evaluation
-        ]
+        runs = [contest.run(label, seed) for seed in range(contest.looks[-1])]
+        if contest.question.score == "training":
+            scores = list[float]()
+            for run in runs:
+                with suppress(ValueError, OSError):  # it has not ended, or cannot be estimated
+                    scores.append(score_of(run, contest.question.window))
+        else:
+            ended = [run.result for run in runs]
+            scores = [
+                result.evaluation["evaluation/interquartile_mean"] for result in ended if result and result.evaluation
+            ]
         if len(set(scores)) > 2 and np.mean(scores) > 0:
             shares.append(float(np.std(scores, ddof=1) / np.mean(scores)))
     if shares:

@@ -2,7 +2,10 @@
 
 import warnings
 
+from atlantis_exp import terminal
+from atlantis_exp.checking import to_dict
 from atlantis_exp.config import EnvConfig
+from atlantis_exp.documents import Query
 from atlantis_exp.game.emulator import query_environment
 
 
@@ -11,6 +14,8 @@ def query(*, env: EnvConfig) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Gymnasium calls the report's environment out of date
         answers = query_environment(env.id)
+    said = {key: answers[key] for key in answers if key != "reward_range"}  # which is infinite
+    terminal.document(Query(environment=said, config=to_dict(env)).model_dump_json())
     frames = env.frameskip if isinstance(env.frameskip, int) else f"{env.frameskip[0]} to {env.frameskip[1] - 1}"
     up, right, down, left = env.crop
     print(f"Action Space: {answers['action_space']}")

@@ -1,11 +1,13 @@
 """Print the results that the outputs folder holds, as a table."""
 
 from collections.abc import Mapping, Sequence
+from math import isfinite
 from pathlib import Path
 
 from rich.table import Table
 
 from atlantis_exp import terminal
+from atlantis_exp.documents import Report, Reported
 from atlantis_exp.runs.folder import EVALUATED, TABLE_COLUMNS, RunFolder, all_runs
 from atlantis_exp.runs.journal import Metrics
 from atlantis_exp.tracking.publishing import catch_up, how_to_open
@@ -20,6 +22,7 @@ def report(outputs: Path, runs: Sequence[str] = (), where: Sequence[str] = ()) -
     """
     catch_up(outputs)
     folders = _chosen(outputs, runs, where)
+    terminal.document(Report(runs=[_reported(run) for run in folders]).model_dump_json())
     if not folders:
         print(f"there is no {'such ' if runs or where else ''}run under {outputs / 'runs'} yet")
         return
@@ -38,6 +41,23 @@ def report(outputs: Path, runs: Sequence[str] = (), where: Sequence[str] = ()) -
     console = terminal.console(least=150)
     console.print(table)
     console.print(how_to_open(outputs), end="", soft_wrap=True)  # a command to copy
+
+
+def _reported(run: RunFolder) -> Reported:
+    result = run.final_result
+    if result is None:
+        steps, evaluation = _last_evaluation(run)
+        at = steps
+    else:
+        steps, evaluation = result.steps, result.evaluation
+        at = steps if result.evaluated_at is None else result.evaluated_at
+    return Reported(
+        run=run.name,
+        state=run.state,
+        steps=steps,
+        evaluated_at=at if evaluation else None,
+        evaluation={key: value for key, value in evaluation.items() if isfinite(value)},
+    )
 
 
 def _chosen(outputs: Path, runs: Sequence[str], where: Sequence[str]) -> list[RunFolder]:

@@ -1,11 +1,17 @@
 """Training scores against naive code, on kept tables, and where a process has a known mean."""
 
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from atlantis_exp.comparison.estimands import FEWEST_EPISODES, TrainingEpisodes, training_score
+from atlantis_exp.comparison.estimands import FEWEST_EPISODES, TrainingEpisodes, by_training, score_of, training_score
+from atlantis_exp.comparison.gather import gather
+from atlantis_exp.faults import ConfigError
+from atlantis_exp.runs.folder import EPISODES, RunFolder
 
 RESULTS = Path(__file__).resolve().parents[2] / "results"
 KEPT = sorted((RESULTS / "verdict" / "runs").glob("*-uniform-s*"))
@@ -101,3 +107,61 @@ def test_a_table_that_is_none_is_named(tmp_path: Path) -> None:
     (tmp_path / "episodes.csv").write_text("episode,step,length\n1,2,3\n")
     with pytest.raises(ValueError, match=r"episodes\.csv is no table of a training's episodes"):
         TrainingEpisodes.read(tmp_path / "episodes.csv")
+
+
+def test_a_kept_run_has_the_score_of_its_steps_and_environments() -> None:
+    folder = RunFolder(KEPT[0])
+    table = TrainingEpisodes.read(folder.artifact(EPISODES))
+    assert score_of(folder) == training_score(table, 1_000_000, 16)
+    assert score_of(folder, 0.5) == training_score(table, 1_000_000, 16, 0.5) != score_of(folder)
+
+
+@pytest.mark.parametrize("row", ["40,nan,10", "40,1e300,10", "40,5,0", "inf,5,10"])
+def test_a_table_with_impossible_numbers_is_refused(row: str, tmp_path: Path) -> None:
+    (tmp_path / "episodes.csv").write_text(f"step,score,length\n{row}\n")
+    with pytest.raises(ValueError, match=r"it has numbers beyond 1e15 or episodes without a step"):
+        TrainingEpisodes.read(tmp_path / "episodes.csv")
+
+
+def of_kept(tmp_path: Path, names: list[str], folder: str = "verdict") -> Path:
+    for name in names:
+        shutil.copytree(DOCS / folder / "runs" / name, tmp_path / "runs" / name)
+    return tmp_path
+
+
+def test_a_run_whose_games_outlast_the_window_is_refused_by_name_and_not_left_out(tmp_path: Path) -> None:
+    name = "cnn-uniform-s2-5b86150e39"
+    outputs = of_kept(tmp_path, [name], "rewards")
+    with pytest.raises(ConfigError, match=rf"^score=training: {name}: 5 episodes ended in the last 20% of 1,250,000"):
+        by_training(gather(outputs).trainings, outputs, 0.2)
+
+
+def test_a_run_without_a_table_of_its_episodes_is_refused_by_name(
+    recorded: Callable[..., Path], tmp_path: Path
+) -> None:
+    name = recorded().name
+    with pytest.raises(ConfigError, match=rf"^score=training: {name}: .*episodes\.csv"):
+        by_training(gather(tmp_path).trainings, tmp_path, 0.2)
+
+
+def test_trainings_whose_epsilon_differs_in_the_window_are_refused_by_name(tmp_path: Path) -> None:
+    names = [run.name for run in KEPT[:2]]
+    outputs = of_kept(tmp_path, names)
+    one, other = gather(outputs).trainings
+    assert [run.training_score for run in by_training([one, other], outputs, 0.2)] == [
+        score_of(RunFolder(outputs / "runs" / name)) for name in names
+    ]
+    epsilon = other.curve["epsilon"].copy()
+    epsilon[other.curve["frames"] < 0.75 * other.curve["frames"][-1]] = 1.0
+    before = replace(other, curve={**other.curve, "epsilon": epsilon})
+    assert len(by_training([one, before], outputs, 0.2)) == 2  # alike within the window
+    with pytest.raises(ConfigError, match=r"epsilon differs in the last 50% of"):
+        by_training([one, before], outputs, 0.5)
+    within = replace(other, curve={**other.curve, "epsilon": other.curve["epsilon"] + 0.02})
+    expected = (
+        f"^score=training: epsilon differs in the last 20% .*: 0.05 in {one.name}; 0.07 in {other.name}; score=last"
+    )
+    with pytest.raises(ConfigError, match=expected):
+        by_training([one, within], outputs, 0.2)
+    with pytest.raises(ConfigError, match=rf"^score=training: {other.name} has no curve"):
+        by_training([one, replace(other, curve={})], outputs, 0.2)

@@ -88,7 +88,7 @@ def test_a_table_of_the_page_has_its_columns_units_and_intervals() -> None:
     assert dict(zip(header, row, strict=True)) == {
         "group": "cnn",
         "seeds": "3",
-        "mean of IQMs (points)": r"12,346 (9,000 to 1.5$\times10^{9}$)",
+        "score (points)": r"12,346 (9,000 to 1.5$\times10^{9}$)",
         "difference (points)": "$-$1,500",
         "verdict": "not decided",
     }

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -16,11 +17,13 @@ import pytest
 
 from atlantis_exp import load_runs
 from atlantis_exp.checking import to_dict
+from atlantis_exp.comparison.estimands import score_of
 from atlantis_exp.comparison.export_tables import UNITS
 from atlantis_exp.comparison.gather import gather
 from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
+from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.statistics import summarize
 from atlantis_exp.training.evaluation import Episode, Evaluation
@@ -29,6 +32,7 @@ Recorded = Callable[..., Path]
 ATLANTIS = facts_of(game_of("Atlantis-v0"))
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "notebooks.md"
 COLUMNS = PAGE.with_name("columns.md")
+KEPT = PAGE.parents[1] / "results" / "verdict" / "runs"
 
 
 def episodes(*scores: float) -> Evaluation:
@@ -343,3 +347,27 @@ def test_a_name_that_the_package_does_not_have_is_an_error() -> None:
 
     with pytest.raises(AttributeError, match="no attribute 'load_run'"):
         atlantis_exp.load_run  # noqa: B018
+
+
+def test_the_score_of_a_run_is_that_of_its_comparison(recorded: Recorded, tmp_path: Path) -> None:
+    recorded()
+    for name in ("cnn-uniform-s0-82f1fe3874", "cnn-uniform-s1-e6500989ab"):
+        shutil.copytree(KEPT / name, tmp_path / "runs" / name)
+    baseline(tmp_path, 40.0, 60.0)
+    last = load_runs(tmp_path).runs.set_index("run")
+    evaluated = "evaluation/interquartile_mean"
+    trained = last[last["kind"] == "training"]
+    assert trained["score"].tolist() == trained[evaluated].tolist()
+    assert last[last["kind"] == "baseline"]["score"].isna().all()
+    kept = [name for name in last.index if name.startswith("cnn-uniform-s") and (KEPT / name).is_dir()]
+    with pytest.warns(UserWarning, match=r"^cnn-uniform-s0-.* has no training score: .*episodes\.csv"):
+        ended = load_runs(tmp_path, score="training", window="30%")
+    scores = ended.runs.set_index("run")["score"]
+    assert scores[kept].tolist() == [score_of(RunFolder(tmp_path / "runs" / name), 0.3) for name in kept]
+    with pytest.warns(UserWarning, match=r"cnn-uniform-s.* has no training score: \d+ episodes ended in the last 1%"):
+        few = load_runs(tmp_path, runs=kept, score="training", window=0.01)
+    assert few.runs["score"].isna().all()
+    with pytest.raises(ConfigError, match=r"^window=2: write a share"):
+        load_runs(tmp_path, score="training", window=2)
+    with pytest.raises(ValueError, match=r"^score=best: should be last or training"):
+        load_runs(tmp_path, score="best")  # type: ignore[arg-type]

@@ -246,9 +246,9 @@ def test_a_baseline_is_compared_with_each_other_one_and_the_table_gets_the_diffe
     ]
     assert "tiny plays worse than cnn by 2,000 points (1," in comparison.verdict
     header, cnn, resnet, tiny = plain("scores", comparison.tables["scores"])
-    assert header == ["group", "seeds", "mean of IQMs", "difference", "verdict"]
+    assert header == ["group", "seeds", "score", "difference", "verdict"]
     assert (cnn[3], resnet[3][:7], tiny[3][:8]) == ("", "2,000 (", "-2,000 (")
-    assert plain("scores", compared(runs).tables["scores"])[0] == ["group", "seeds", "mean of IQMs"]
+    assert plain("scores", compared(runs).tables["scores"])[0] == ["group", "seeds", "score"]
 
 
 def test_a_baseline_may_be_a_value_of_a_key_or_a_group_and_nothing_else() -> None:

@@ -5,16 +5,24 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import mlflow
 import pytest
 
 from atlantis_exp.commands.compare import VERB
+from atlantis_exp.comparison.estimands import score_of
 from atlantis_exp.config import Config
+from atlantis_exp.documents import Compared
+from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.sessions import comparing
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.training import train
 
 Recorded = Callable[..., Path]
+KEPT = Path(__file__).parents[2] / "docs" / "verdict"
+DECISION = "decide-7cfff86226"  # cnn against resnet_fast, ten seeds each
+LOOKS = json.loads((KEPT / "comparisons" / "cnn-vs-resnet-fast-e09e14bb20" / "looks.json").read_text())
 
 
 def test_a_comparison_is_a_page_figures_and_tables_in_a_folder_and_in_the_store(
@@ -139,3 +147,129 @@ def test_a_real_training_can_be_compared(
             if row["group"] == "seed=0"
         ]
     assert sum(shares) == pytest.approx(1)
+
+
+@pytest.fixture
+def of_json(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Compared]:
+    """Compares and returns the document; without figures, which take seconds."""
+    monkeypatch.setattr(comparing, "draw", lambda _: {})
+
+    def compared(*words: str) -> Compared:
+        capfd.readouterr()
+        VERB.run([f"paths.outputs={tmp_path}", "tracking=none", "format=json", *words])
+        (line,) = capfd.readouterr().out.splitlines()
+        return Compared.model_validate_json(line)
+
+    return compared
+
+
+def runs_of_the_decision() -> list[str]:
+    names: list[str] = json.loads((KEPT / "decisions" / DECISION / "config.json").read_text())["runs"]
+    return names
+
+
+def looks_in(outputs: Path) -> list[dict[str, Any]]:
+    (path,) = outputs.glob("comparisons/*/looks.json")
+    (looks,) = json.loads(path.read_text()).values()
+    return [*looks]
+
+
+def test_a_table_of_scores_has_the_looks_and_the_verdict_of_the_runs_that_they_are_of(
+    of_json: Callable[..., Compared], tmp_path: Path
+) -> None:
+    rows = []
+    for folder in (RunFolder(KEPT / "runs" / name) for name in runs_of_the_decision()):
+        result, config = folder.result, folder.trained_config
+        assert result is not None
+        score = result.evaluation["evaluation/interquartile_mean"]
+        for shift in (-70.0, 70.0):  # rows of a seed are averaged
+            rows.append((config.seed, f"{config.model.name},{config.seed},{score + shift}"))
+    assert len(rows) == 40
+    table = tmp_path / "scores.csv"
+    for seeds in (5, 10):  # more seeds of the same table are the same comparison
+        table.write_text("\n".join(["algo,seed,return", *(text for seed, text in rows if seed < seeds)]))
+        answer = of_json(f"scores={table}", "columns=group=algo,score=return")
+    assert (answer.question.score, answer.question.by) == ("file", ["group"])
+    assert answer.decided
+    assert answer.verdict.startswith("cnn plays better than resnet_fast by 13,813 points (5,327 to 22,300, 10 seeds")
+    for look, kept in zip(looks_in(tmp_path), LOOKS["model"], strict=True):
+        assert (look["seeds"], look["error"]) == (kept["seeds"], pytest.approx(kept["error"]))
+        ((verdict,), (before,)) = look["verdicts"], kept["verdicts"]
+        for key in ("group", "other", "said", "seeds"):
+            assert verdict[key] == before[key]
+        for key in ("difference", "low", "high"):
+            assert verdict[key] == pytest.approx(before[key], rel=1e-9)
+    (page,) = tmp_path.glob("comparisons/cnn-vs-resnet-fast-*/artifacts/comparison.html")
+    assert "cnn plays better than resnet_fast by 13,813 points" in page.read_text()
+    assert "the mean of the seed&#39;s rows in a table" in page.read_text()
+
+
+def test_a_table_of_scores_is_drawn_with_its_seeds_and_nothing_else(tmp_path: Path) -> None:
+    rows = [f"{group},{seed},{base + seed}" for group, base in (("a", 1.0), ("b", 9.0)) for seed in range(5)]
+    (tmp_path / "s.csv").write_text("\n".join(["group,seed,score", *rows]))
+    VERB.run([f"paths.outputs={tmp_path}", "tracking=none", f"scores={tmp_path / 's.csv'}", "baseline=a"])
+    (page,) = tmp_path.glob("comparisons/*/artifacts/comparison.html")
+    assert {path.name for path in page.parent.glob("figures/*.png")} == {"scores.png"}
+    assert r"difference (points)" in (page.parent / "tables" / "scores.tex").read_text()
+    for heading in ("Why", "Episodes", "Runs", "Learning"):
+        assert f"<h2>{heading}" not in page.read_text()
+
+
+@pytest.mark.parametrize("word", ["by=seed", "runs=cnn", "where=seed=0", "at_epsilon=0.05", "score=training"])
+def test_what_is_asked_of_runs_is_refused_with_a_table_of_scores(
+    word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        VERB.run([f"paths.outputs={tmp_path}", f"scores={tmp_path / 's.csv'}", word])
+    key = word.partition("=")[0]
+    assert capsys.readouterr().err.startswith(f"atlantis_exp: {key}: is of runs, not of scores=")
+
+
+@pytest.mark.parametrize("columns", ["return", "score=", "points=return"])
+def test_a_column_that_is_none_of_a_table_of_scores_is_refused(
+    columns: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        VERB.run([f"columns={columns}"])
+    assert capsys.readouterr().err.startswith("atlantis_exp: columns=")
+
+
+@pytest.mark.parametrize("window", ["0", "20", "120%", "half", "-0.1"])
+def test_a_window_that_is_no_share_is_refused(window: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        VERB.run([f"window={window}"])
+    assert "write a share, as in window=20% or window=0.2" in capsys.readouterr().err
+
+
+def test_the_training_score_is_one_quantity_with_looks_of_its_own(
+    of_json: Callable[..., Compared], tmp_path: Path
+) -> None:
+    shutil.copytree(KEPT / "decisions" / DECISION, tmp_path / "decisions" / DECISION)
+    expected: dict[str, dict[int, float]] = {"cnn": {}, "resnet_fast": {}}
+    for name in runs_of_the_decision():
+        folder = RunFolder(shutil.copytree(KEPT / "runs" / name, tmp_path / "runs" / name))
+        expected[name.partition("-")[0]][folder.trained_config.seed] = score_of(folder)
+    words = ("by=model", f"runs={DECISION}", "at_epsilon=0.05")
+    answer = of_json(*words, "score=training", "window=20%")
+    assert {each.group: each.seeds for each in answer.scores} == expected
+    (verdict,) = answer.verdicts
+    means = [sum(expected[name][seed] for seed in range(verdict.seeds)) / verdict.seeds for name in expected]
+    assert verdict.difference == pytest.approx(means[0] - means[1])
+    assert answer.verdict.startswith("By score=training window=20%: cnn plays better than resnet_fast by ")
+    assert answer.caveats[0].startswith("The score is the seed's points in the last 20% of its training")
+    (page,) = tmp_path.glob("comparisons/*/artifacts/comparison.html")
+    for text in (answer.caveats[0], page.read_text()):
+        assert "the process of learning, not the network one keeps" in text
+    for name in ("seeds", "runs"):
+        with open(page.parent / "tables" / f"{name}.csv") as file:
+            shown = sorted(float(row["score (points)"]) for row in csv.DictReader(file))
+        assert shown == sorted(score for seeds in expected.values() for score in seeds.values())
+
+    assert of_json(*words).question.window is None
+    before = tmp_path / "comparisons" / "cnn-vs-resnet-fast-e09e14bb20" / "looks.json"  # as named before the choice
+    assert json.loads(before.read_text())["model"][0]["verdicts"][0]["seeds"] == 10
+    assert len(list(tmp_path.glob("comparisons/*/looks.json"))) == 2
+    of_json(*words, "score=training", "window=0.3")
+    assert len(list(tmp_path.glob("comparisons/*/looks.json"))) == 3

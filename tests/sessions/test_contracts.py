@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from atlantis_exp.commands.app import Asked
-from atlantis_exp.commands.check import VERB
+from atlantis_exp.commands.check import _work
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.components import KINDS, admit
 from atlantis_exp.config import Config
@@ -155,7 +155,7 @@ def test_components_that_are_named_are_tried_and_no_others(
     (tmp_path / "mine.py").write_text(PARTS)
     words = [text for text in tiny_overrides if text.partition("=")[0] not in KINDS]
     ((overrides, config),) = check("config", Config, [*words, f"plugins={tmp_path / 'mine.py'}", *chosen]).items()
-    call: Any = VERB.work(Asked(config, "check", overrides))
+    call: Any = _work(Asked(config, "check", overrides))
     trials, jobs = call.args
     assert {part for part, *_ in trials} == {*tried, "all"}
     assert [*jobs] == measured

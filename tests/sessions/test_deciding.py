@@ -269,8 +269,28 @@ def test_the_command_that_compares_is_read_as_it_is_meant(asking: Asking, tmp_pa
     (config,) = check("compare", CompareConfig, COMPARE.rewrite(words)).values()
     assert config.question == contest.question
     assert config.question.delta == 1_234_567
+    assert config.question.identity.keys() == {"by", "seeds", "error", "delta", "relative", "baseline"}
     assert config.at_epsilon == 0.05
     assert config.paths.outputs == str(tmp_path)
+
+
+def test_a_question_about_the_training_score_is_handed_on_with_its_window(asking: Asking) -> None:
+    contest = asking("optimizer.lr=0.001,0.002", "score=training", "window=25%", "format=json")
+    words = shlex.split(contest.comparing)[4:]
+    (config,) = check("compare", CompareConfig, COMPARE.rewrite(words)).values()
+    assert config.question == contest.question
+    assert (config.question.score, config.question.window) == ("training", 0.25)
+    other = asking("optimizer.lr=0.001,0.002", "score=training", "window=20%")
+    assert other.folder != contest.folder
+    assert asking("optimizer.lr=0.001,0.002", "window=25%").folder == asking("optimizer.lr=0.001,0.002").folder
+
+
+def test_contenders_that_explore_differently_are_refused_by_the_training_score_before_they_are_trained(
+    asking: Asking,
+) -> None:
+    asking("epsilon=constant", "epsilon.value=0.1,0.2")
+    with pytest.raises(ConfigError, match=r"^score=training: contenders differ in epsilon, .*; use score=last$"):
+        asking("epsilon=constant", "epsilon.value=0.1,0.2", "score=training")
 
 
 def test_the_same_question_is_the_same_decision_however_it_is_written(asking: Asking) -> None:
@@ -278,7 +298,7 @@ def test_the_same_question_is_the_same_decision_however_it_is_written(asking: As
     again = asking("optimizer.lr=0.002,1e-3", "budget.steps=1000000", "threads=2", "tracking=mlflow")
     assert again.folder == one.folder
     assert again.folder.path.parent.name == "decisions"
-    for words in (("budget.steps=2_000_000",), ("budget.steps=1_000_000", "delta=5%")):
+    for words in (("budget.steps=2_000_000",), ("budget.steps=1_000_000", "delta=5%"), ("score=training",)):
         assert asking("optimizer.lr=0.001,0.002", *words).folder != one.folder
 
 
