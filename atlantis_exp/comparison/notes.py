@@ -12,11 +12,10 @@ from atlantis_exp.comparison.decision import condition, equal_scores, modes, siz
 from atlantis_exp.comparison.gather import AXES, StoredRun, Training
 from atlantis_exp.comparison.published import Table, early_dqn, random_line
 from atlantis_exp.comparison.verdict import Answer, group_of
+from atlantis_exp.comparison.words import listed
 from atlantis_exp.components import Component, facts_of
 from atlantis_exp.runs.folder import LOST
 from atlantis_exp.terminal import PROGRAM
-
-_NAMED = 6  # runs, up to which a line names them
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ def collapsed(facts: Facts) -> Iterator[str]:
         if names := [run.name for run in runs if run.has_collapsed]:
             yield (
                 f"{len(names)} of {len(runs)} runs of {label} collapsed to one action, so their scores say little of "
-                f"learning: {_listed(names)}."
+                f"learning: {listed(names)}."
             )
 
 
@@ -78,7 +77,7 @@ def lost_seeds(facts: Facts) -> Iterator[str]:
     for label, missing in names.items():
         yield (
             f"{label} lacks {len(missing)} {'seed' if len(missing) == 1 else 'seeds'}, unfinished or unusable: "
-            f"{_listed(missing)}. If how it played is the reason, the others do not stand for it."
+            f"{listed(missing)}. If how it played is the reason, the others do not stand for it."
         )
 
 
@@ -90,7 +89,7 @@ def equal(facts: Facts) -> Iterator[str]:
         alike[tuple(dict.fromkeys(label_of[name] for name in names))].extend(names)
     for labels, names in alike.items():
         has = "has" if len(labels) == 1 else "have"
-        yield f"{' and '.join(labels)} {has} runs with the same score in every episode: {_listed(names)}."
+        yield f"{' and '.join(labels)} {has} runs with the same score in every episode: {listed(names)}."
 
 
 def modes_found(facts: Facts) -> Iterator[str]:
@@ -127,21 +126,21 @@ def unlike(facts: Facts) -> Iterator[str]:
         for run in runs:
             holders[value(run)].append(run.name)
         if len(holders) > 1:
-            named = "; ".join(f"{value}: {_listed(names)}" for value, names in sorted(holders.items()))
+            named = "; ".join(f"{value}: {listed(names)}" for value, names in sorted(holders.items()))
             yield f"The runs were {how}: {named}."
 
 
 def lossy(facts: Facts) -> Iterator[str]:
     """Name runs that went on without a part of their replay memory."""
     if names := [run.name for run in facts.trainings if LOST in run.tags]:
-        yield f"Went on without a part of their replay memory, which was damaged: {_listed(names)}."
+        yield f"Went on without a part of their replay memory, which was damaged: {listed(names)}."
 
 
 def uncommitted(facts: Facts) -> Iterator[str]:
     """Name runs of code that no commit holds, if commits are compared."""
     names = [run.name for run in facts.trainings if run.tags.get("git.dirty") == "true"]
     if COMMIT in facts.by and names:
-        yield f"Made with changes that their commit does not hold: {_listed(names)}."
+        yield f"Made with changes that their commit does not hold: {listed(names)}."
 
 
 def unbalanced(facts: Facts) -> Iterator[str]:
@@ -151,7 +150,7 @@ def unbalanced(facts: Facts) -> Iterator[str]:
         if family.left_out:
             yield (
                 f"By {family.name}, groups without a counterpart for every value are left out: "
-                f"{_listed(family.left_out)}."
+                f"{listed(family.left_out)}."
             )
         for value, members in family.groups.items():
             if members and (alone := set.union(*(set(group.seeds) for group in members)) - family.seeds[value].keys()):
@@ -177,7 +176,7 @@ def later_seeds(facts: Facts) -> Iterator[str]:
     if late:
         yield (
             "Verdicts rest on the seeds of their looks, scores are of all seeds there are: "
-            f"{_listed([f'{value} has {seeds}' for value, seeds in late.items()])}."
+            f"{listed([f'{value} has {seeds}' for value, seeds in late.items()])}."
         )
 
 
@@ -197,7 +196,7 @@ def moved_seeds(facts: Facts) -> Iterator[str]:
         if moved := [pair for pair, is_so in stands.items() if not is_so]:
             yield (
                 f"By {answer.family.name}, runs of past looks are gone or have other scores now, and their verdicts "
-                f"stay: {_listed(moved)}."
+                f"stay: {listed(moved)}."
             )
 
 
@@ -243,7 +242,7 @@ def begun(facts: Facts) -> Iterator[str]:
     """Name the weights that trainings began with."""
     for label, runs in facts.groups.items():
         if weights := dict.fromkeys(str(run.config[key]) for run in runs if run.config.get(key := "training.weights")):
-            yield f"{label} began with {_listed([*weights])}; what that took counts in no frames, hours or arithmetic."
+            yield f"{label} began with {listed([*weights])}; what that took counts in no frames, hours or arithmetic."
 
 
 def survival_and_rate(facts: Facts) -> Iterator[str]:
@@ -308,11 +307,6 @@ NOTES: Sequence[Note] = (
     *(capped, measured_players, random_player),
 )
 """What is said after it."""
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = len(names) - _NAMED
-    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _values(keys: Mapping[str, Sequence[str]]) -> str:

@@ -10,10 +10,10 @@ from math import isnan
 
 import numpy as np
 
+from atlantis_exp.comparison.account import Account
 from atlantis_exp.comparison.choosing import plays_alike
 from atlantis_exp.comparison.decision import (
     FEWEST_SEEDS,
-    Look,
     Plan,
     Verdict,
     decide,
@@ -55,19 +55,20 @@ def compare(
     gathered: Gathered,
     groups: Groups,
     question: Question,
-    record: Mapping[str, Sequence[Look]] | None = None,
+    account: Account | None = None,
     now: bool = False,
 ) -> Comparison:
     """Compare groups of trainings, taking the looks that are due, or with `now` one that is not.
 
     Args:
-        record: the looks taken before, by family.
+        account: the looks taken before, and the error that is left.
 
     Raises:
         ConfigError: if the baseline is not among what is compared.
     """
+    account = account or Account()
     seeds_of = [group_of(runs, question.by) for runs in groups.values()]
-    answers = answer(families(seeds_of, question), record or {}, now)
+    answers = answer(account.limit(families(seeds_of, question)), account.record, now)
     trainings = [training for runs in groups.values() for training in runs]
     component = trainings[0].game
     game = facts_of(component)
@@ -108,6 +109,7 @@ def compare(
     }
     facts = Facts(component, groups, gathered.lost, question.by, answers, tables, frames)
     caveats, notes = ([line for note in each for line in note(facts)] for each in (CAVEATS, NOTES))
+    caveats = [*account.lines, *caveats]
     if now and answers and all(each.taken is None for each in answers):
         caveats.append("look=now took no look: no undecided group has new seeds, or one has fewer than five.")
     verdict, *others = _sentences(answers, list(groups))

@@ -9,7 +9,7 @@ from atlantis_exp.comparison.decision import Plan, Verdict
 from atlantis_exp.comparison.verdict import Answer
 
 _IN_FULL = 3  # pairs of a family, up to which each is said with its interval
-_LISTED = 6  # undecided pairs, up to which they are named
+_LISTED = 6  # undecided pairs or runs, up to which they are named
 
 
 def said(answer: Answer) -> str:
@@ -80,6 +80,12 @@ def margin(plan: Plan) -> str:
     if plan.delta is None:
         return ""
     return f"{100 * plan.delta:g} %" if plan.relative else f"{_points(plan.delta)} points"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names in a row, the first few of many."""
+    more = len(names) - _LISTED
+    return ", ".join(names[:_LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _gap(verdict: Verdict, other: str, in_full: bool, turned: bool) -> str:

@@ -14,6 +14,7 @@ from rich.text import Text
 from atlantis_exp import terminal
 from atlantis_exp.checking import digest, flatten
 from atlantis_exp.comparison import tables
+from atlantis_exp.comparison.account import read_account
 from atlantis_exp.comparison.choosing import (
     COMMIT,
     group,
@@ -26,7 +27,7 @@ from atlantis_exp.comparison.choosing import (
 from atlantis_exp.comparison.export_tables import to_latex, with_units
 from atlantis_exp.comparison.figures import Drawn, draw
 from atlantis_exp.comparison.gather import Gathered, Player, Training, gather, refuse_unknown
-from atlantis_exp.comparison.looks import read_looks, write_looks
+from atlantis_exp.comparison.looks import write_looks
 from atlantis_exp.comparison.page import page, plain
 from atlantis_exp.comparison.tables import Comparison
 from atlantis_exp.comparison.verdict import Question, families, group_of, worse_than_baseline
@@ -86,14 +87,14 @@ def compare(
         "atlantis.kind": "comparison",
     }
     with folder.held():
-        record = read_looks(folder.path, asked)
+        account = read_account(folder, asked, identity, [training.name for training in trainings])
         with terminal.working("computing the tables"):
-            comparison = tables.compare(gathered, groups, question, record, look_now)
+            comparison = tables.compare(gathered, groups, question, account, look_now)
         write_looks(folder.path, comparison.answers)
         with terminal.working("drawing the figures"):
             figures = draw(comparison)
         with publishing(folder, tracking, outputs, labels) as journal:
-            folder.write_config(facts := {**identity, "compared": [training.name for training in trainings]})
+            folder.write_config(facts := {**identity, **account.kept})
             journal.params({key: str(value) for key, value in flatten(facts).items()})
             _write(journal, comparison, figures, provenance(command), f"{len(trainings)} under {outputs / 'runs'}")
     _print(comparison)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from atlantis_exp.commands.compare import VERB
+from atlantis_exp.comparison.account import Account
 from atlantis_exp.comparison.choosing import PROTOCOL, group
 from atlantis_exp.comparison.decision import Look, mean_interval
 from atlantis_exp.comparison.figures import draw
@@ -86,7 +87,7 @@ def compared(
 ) -> Comparison:
     """What the comparison of some runs by some keys, or by model, says."""
     by = by or ("model",)
-    return compare(Gathered(list(runs)), group(runs, by), Question(by, **question), record, now)
+    return compare(Gathered(list(runs)), group(runs, by), Question(by, **question), Account(record or {}), now)
 
 
 def record_of(comparison: Comparison) -> dict[str, list[Look]]:
