@@ -69,7 +69,7 @@ class Asked:
 class Account:
     """What a question may still spend, and what must be said of it."""
 
-    record: Record = field(default_factory=dict)
+    record: Mapping[str, Sequence[Look]] = field(default_factory=dict)
     errors: Mapping[str, float] = field(default_factory=dict)  # of families that continue an earlier one
     root: str = ""  # the comparison that was continued
     compared: Sequence[str] = ()  # all runs that were ever asked
@@ -150,17 +150,18 @@ def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], 
         else:
             roots.append(mine.root if family.name in errors else mine.name)
     root = roots[0] if len({*roots}) == 1 else mine.name
-    sizes = {look.size for looks in record.values() for look in looks}
-    told = [
-        other
-        for other in others
-        if other.spent and {*other.compared} & {*mine.compared} and not (other.root == root and other.sizes <= sizes)
-    ]
+    sizes = {look.size for looks in record.values() for look in looks}  # and those that it will look at
+    sizes |= {size for family in asked for size in family.plan.looks if size > max(sizes, default=0)}
+    told: dict[str, float] = {}  # error spent, by account
+    for other in others:
+        is_mine = other.root == root and other.sizes <= sizes
+        if other.spent and not is_mine and {*other.compared} & {*mine.compared}:
+            told[other.root] = max(told.get(other.root, 0.0), other.spent)
     if told:
         questions = "1 other question" if len(told) == 1 else f"{len(told)} other questions"
+        spent = f"{sum(told.values()):.2%}"
         lines.append(
-            f"These runs have been asked {questions}, which spent {sum(other.spent for other in told):.2%}; the error "
-            f"of this one comes on top."
+            f"These runs have been asked {questions}, which spent {spent}; the error of this one is on top of it."
         )
     same = [other for other in others if {*other.identities.values()} == {*mine.identities.values()}]
     if gone := sorted({*mine.compared}.union(*(other.compared for other in same)) - {*runs}):
@@ -222,7 +223,7 @@ def _part(family: Family, asked: Sequence[Family], mine: Asked, other: Asked) ->
         return None
     # As at the other question's next look, its open pairs share what is left; with delta all of its pairs do.
     still, of_all = (sum(verdict.said == "not decided" for verdict in each[-1].verdicts) for each in (looks, whole))
-    share = still / max(of_all, 1) if mine.delta is None else len(pairs) / every
+    share = len(pairs) / every if mine.delta is not None or every == len(pairs) else still / max(of_all, 1)
     error = sum(look.error for look in looks) + share * max(left, 0.0)
     return _Part(looks, error, every if every > len(pairs) else 1)
 

@@ -3,16 +3,27 @@
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isclose, nan
-from statistics import fmean
+from statistics import fmean, variance
 
 from atlantis_exp.comparison.choosing import COMMIT, resolve, values_in
-from atlantis_exp.comparison.decision import condition, equal_scores, modes, size_found
+from atlantis_exp.comparison.decision import (
+    Look,
+    Verdict,
+    condition,
+    equal_scores,
+    improvement,
+    may_be_best,
+    modes,
+    no_worse,
+    seeds_needed,
+    size_found,
+)
 from atlantis_exp.comparison.gather import AXES, StoredRun, Training
 from atlantis_exp.comparison.published import Table, early_dqn, random_line
 from atlantis_exp.comparison.verdict import Answer, group_of
-from atlantis_exp.comparison.words import listed
+from atlantis_exp.comparison.words import IN_FULL, listed, margin, spent
 from atlantis_exp.components import Component, facts_of
 from atlantis_exp.runs.folder import LOST
 from atlantis_exp.terminal import PROGRAM
@@ -39,22 +50,74 @@ class Facts:
 Note = Callable[[Facts], Iterator[str]]
 
 
+def stands(facts: Facts) -> Iterator[str]:
+    """Say what each answer rests on: looks, seeds, error and length of training."""
+    length = f"; trained for up to {facts.frames:,.0f} frames" if facts.frames else ""
+    for answer in facts.answers:
+        yield f"By {answer.family.name}: {spent(answer)}{length}."
+
+
 def conditions(facts: Facts) -> Iterator[str]:
     """Say how much each verdict leans on its condition, and how much its difference is overstated."""
+    for _, look, verdict, values in _looked_at(facts):
+        if verdict.said in ("better", "worse"):
+            one, other = _better_first(verdict)
+            found = condition(verdict, look, values)
+            yield (
+                f"{one} against {other}: looks find large differences first; the true one is rather "
+                f"{abs(size_found(verdict, look)):,.0f} points. The error holds for groups whose seeds are spread "
+                f"alike: here by {found.spreads:.1f} times as much in one as in the other, and if "
+                f"{found.undone_by:.0%} of the seeds of {one} collapsed, it would be no better; "
+                f"{verdict.seeds} seeds without a collapse leave up to {found.unseen:.0%} possible."
+            )
+
+
+def further_answers(facts: Facts) -> Iterator[str]:
+    """Say which groups may be best, and of a few pairs how often a seed wins, and what remains possible."""
     for answer in facts.answers:
-        taken = [(look, verdict) for look in answer.decision.looks for verdict in look.verdicts]
-        for look, verdict in taken:
-            pair = (verdict.group, verdict.other) if verdict.said == "better" else (verdict.other, verdict.group)
-            there = all(set(look.seeds[name]) <= answer.family.seeds[name].keys() for name in pair)
-            if verdict.said in ("better", "worse") and there:
-                found = condition(verdict, look, answer.family.seeds)
-                yield (
-                    f"{pair[0]} against {pair[1]}: looks find large differences first; the true one is rather "
-                    f"{abs(size_found(verdict, look)):,.0f} points. The error holds for groups whose seeds are spread "
-                    f"alike: here by {found.spreads:.1f} times as much in one as in the other, and if "
-                    f"{found.undone_by:.0%} of the seeds of {pair[0]} collapsed, it would be no better; "
-                    f"{verdict.seeds} seeds without a collapse leave up to {found.unseen:.0%} possible."
+        plan, verdicts = answer.family.plan, answer.decision.verdicts
+        best = may_be_best(answer.decision)
+        if plan.baseline is None and 1 < len(best) < len(answer.family.seeds):
+            yield f"By {answer.family.name}, with {1 - plan.error:.0%} the best is one of {listed(best)}."
+    for answer, look, verdict, values in _looked_at(facts):
+        plan, verdicts = answer.family.plan, answer.decision.verdicts
+        if len(verdicts) > IN_FULL:
+            continue
+        one, other = _better_first(verdict)
+        seeds = [[values[name][seed] for seed in look.seeds[name]] for name in (one, other)]
+        low, share, high = improvement(*seeds)
+        said = [f"a seed of {one} beats one of {other} with {share:.0%} ({low:.0%} to {high:.0%})"]
+        if verdict.said == "not decided":
+            delta = (plan.delta or 0.0) * (
+                abs(fmean(seeds[1] if plan.baseline == other else map(fmean, seeds))) if plan.relative else 1
+            )
+            turned = replace(verdict, low=-verdict.high)
+            said += [
+                f"{name} is no worse by more than {margin(plan)}"
+                for name, of in ((verdict.group, verdict), (verdict.other, turned))
+                if delta and no_worse(of, delta)
+            ]
+            spread = fmean(map(variance, seeds)) ** 0.5
+            if spread and verdict.difference:
+                needed = seeds_needed(verdict.difference, spread, plan.error, len(verdicts))
+                said.append(
+                    f"a difference of this size takes {needed or 'more than 1,000'} seeds each to be found with 80 %"
                 )
+        yield f"{'; '.join(said)}."
+
+
+def _looked_at(facts: Facts) -> Iterator[tuple[Answer, Look, Verdict, dict[str, dict[int, float]]]]:
+    """Yield the last verdict of each pair with its look and the families' values, where the look's seeds are there."""
+    for answer in facts.answers:
+        last = {(of.group, of.other): (look, of) for look in answer.decision.looks for of in look.verdicts}
+        for pair, (look, verdict) in last.items():
+            if all({*look.seeds[name]} <= answer.family.seeds[name].keys() for name in pair):
+                yield answer, look, verdict, answer.family.seeds
+
+
+def _better_first(verdict: Verdict) -> tuple[str, str]:
+    pair = verdict.group, verdict.other
+    return pair if verdict.difference > 0 else pair[::-1]
 
 
 def collapsed(facts: Facts) -> Iterator[str]:
@@ -79,6 +142,18 @@ def lost_seeds(facts: Facts) -> Iterator[str]:
             f"{label} lacks {len(missing)} {'seed' if len(missing) == 1 else 'seeds'}, unfinished or unusable: "
             f"{listed(missing)}. If how it played is the reason, the others do not stand for it."
         )
+
+
+def gaps(facts: Facts) -> Iterator[str]:
+    """Name seeds that a group lacks though others have them and it has later ones: left out, perhaps, for a score."""
+    seeds = {label: {run.config["seed"] for run in runs} for label, runs in facts.groups.items()}
+    lost = {run.config["seed"] for run in facts.lost}
+    for label, own in seeds.items():
+        if missing := sorted(seed for seed in set().union(*seeds.values()) - own - lost if seed < max(own)):
+            yield (
+                f"{label} goes without seed {listed([str(seed) for seed in missing])}, which others have. If its score "
+                f"is the reason, the error does not hold."
+            )
 
 
 def equal(facts: Facts) -> Iterator[str]:
@@ -297,7 +372,7 @@ def random_player(facts: Facts) -> Iterator[str]:
 
 
 CAVEATS: Sequence[Note] = (
-    *(conditions, collapsed, lost_seeds, equal, modes_found, unlike, lossy, uncommitted),
+    *(stands, further_answers, conditions, collapsed, lost_seeds, gaps, equal, modes_found, unlike, lossy, uncommitted),
     *(unbalanced, later_seeds, moved_seeds),
 )
 """What may make a verdict mean something else."""

@@ -8,14 +8,14 @@ import numpy as np
 from atlantis_exp.comparison.decision import Plan, Verdict
 from atlantis_exp.comparison.verdict import Answer
 
-_IN_FULL = 3  # pairs of a family, up to which each is said with its interval
+IN_FULL = 3  # pairs of a family, up to which each is said with its interval
 _LISTED = 6  # undecided pairs or runs, up to which they are named
 
 
 def said(answer: Answer) -> str:
     """Say what is decided and what is not; the better ones come first."""
     verdicts = answer.decision.verdicts
-    in_full = len(verdicts) <= _IN_FULL
+    in_full = len(verdicts) <= IN_FULL
     baseline = answer.family.plan.baseline
     better: dict[tuple[str, str], list[str]] = defaultdict(list)
     for verdict in verdicts:
@@ -39,7 +39,7 @@ def said(answer: Answer) -> str:
 
 
 def _undecided(answer: Answer, verdicts: Sequence[Verdict]) -> str:
-    decision, in_full = answer.decision, len(answer.decision.verdicts) <= _IN_FULL
+    decision, in_full = answer.decision, len(answer.decision.verdicts) <= IN_FULL
     if len(verdicts) > _LISTED:
         text = f"Not decided: {len(verdicts)} of {len(decision.verdicts)} pairs"
     else:

@@ -31,7 +31,6 @@ from atlantis_exp.comparison.looks import write_looks
 from atlantis_exp.comparison.page import page, plain
 from atlantis_exp.comparison.tables import Comparison
 from atlantis_exp.comparison.verdict import Question, families, group_of, worse_than_baseline
-from atlantis_exp.comparison.words import spent
 from atlantis_exp.config import TrackingConfig
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
@@ -182,8 +181,6 @@ def _print(comparison: Comparison) -> None:
     for note in comparison.notes:
         console.print(f"- {note}")
     console.print()
-    for each in comparison.answers:
-        console.print(f"By {each.family.name}: {spent(each)}.")
     for sentence in comparison.caveats:
         console.print(f"- {sentence}")
     for sentence in (*reversed(comparison.others), comparison.verdict):

@@ -638,6 +638,27 @@ def test_a_worse_commit_ends_with_exit_code_1_and_one_line(record_seeds: Callabl
         assert f"baseline={other}: no such group" in run("by=git.commit", f"baseline={other}", code=2)
 
 
+@pytest.mark.usefixtures("_undrawn")
+def test_runs_that_were_asked_before_go_on_with_their_looks_and_are_told_of_other_questions(
+    record_seeds: Callable[..., list[Path]], run: Run, tmp_path: Path
+) -> None:
+    for model, score in (("cnn", 3_000.0), ("resnet", 3_015.0), ("resnet_fast", 9_000.0)):
+        first, *_ = record_seeds(model, score)
+    assert "have been asked" not in run("runs=cnn,resnet-", "seeds=5")
+    shown = run("runs=resnet-,cnn", "seeds=20")
+    assert "By model, this continues the looks of cnn-vs-resnet-" in shown
+    assert "5.00% of 5.00%" in shown
+    assert "These runs have been asked 1 other question, which spent 5.00%;" in (whole := run())
+    shutil.rmtree(first)
+    assert f"Compared before, and gone or left out now: {first.name}." in run()
+    assert "of whose 3 pairs it is a part" in run("runs=cnn,resnet_fast")
+    assert "cannot be read" not in whole
+    broken = next((tmp_path / "comparisons").glob("cnn-vs-resnet-vs-*")) / "looks.json"
+    broken.write_text("{}"[:1])
+    assert f"cannot be read: {broken.parent.name}." in run("runs=cnn,resnet-")
+    assert run(code=1).startswith(f"atlantis_exp: {broken} is no record")
+
+
 OLD, NEW = "0123456789abcdef0123456789abcdef01234567", "fedcba9876543210fedcba9876543210fedcba98"
 
 
