@@ -584,8 +584,12 @@ def asked_again(
                 shutil.copytree(run, tmp_path / "runs" / run.name)
             capsys.readouterr()
             assert command(*question.split(), "tracking=none", f"paths.outputs={tmp_path}") == 0
-        said = " ".join(capsys.readouterr().out.split())
+        printed = capsys.readouterr().out
         (made,) = tmp_path.glob("comparisons/*")
+        notes = re.sub(
+            "<svg.*?</svg>|<header>.*?</header>", "", (made / "artifacts/comparison.html").read_text(), flags=re.S
+        )
+        said = " ".join((printed + notes[notes.index("What else to know") :]).split())
         kept = DOCS / "verdict" / "comparisons" / made.name
         assert (made / "looks.json").read_text() == (kept / "looks.json").read_text()
         for name in ("verdict", "views", "runs"):

@@ -172,6 +172,13 @@ def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], 
     return Account(record, errors, root, mine.compared, lines)
 
 
+def seeds_between(seeds: Mapping[str, Collection[int]], lost: Collection[int] = ()) -> dict[str, list[int]]:
+    """Return the seeds that groups lack although others have them and they have later ones, but for lost ones."""
+    every = {seed for own in seeds.values() for seed in own} - {*lost}
+    missing = {label: sorted(seed for seed in every - {*own} if seed < max(own)) for label, own in seeds.items()}
+    return {label: found for label, found in missing.items() if found}
+
+
 _ASKED = TypeAdapter(Asked)
 
 

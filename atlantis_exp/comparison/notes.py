@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from math import isclose, nan
 from statistics import fmean, variance
 
+from atlantis_exp.comparison.account import seeds_between
 from atlantis_exp.comparison.choosing import COMMIT, resolve, values_in
 from atlantis_exp.comparison.decision import (
     Look,
@@ -40,6 +41,7 @@ class Facts:
     answers: Sequence[Answer]
     tables: Mapping[str, Table]
     frames: float  # of the longest training
+    account: Sequence[str] = ()  # what other questions about the runs mean for this one
 
     @property
     def trainings(self) -> list[Training]:
@@ -51,10 +53,11 @@ Note = Callable[[Facts], Iterator[str]]
 
 
 def stands(facts: Facts) -> Iterator[str]:
-    """Say what each answer rests on: looks, seeds, error and length of training."""
+    """Say what each answer rests on: looks, seeds, error, length of training, and other questions."""
     length = f"; trained for up to {facts.frames:,.0f} frames" if facts.frames else ""
     for answer in facts.answers:
         yield f"By {answer.family.name}: {spent(answer)}{length}."
+    yield from facts.account
 
 
 def conditions(facts: Facts) -> Iterator[str]:
@@ -86,7 +89,7 @@ def further_answers(facts: Facts) -> Iterator[str]:
         one, other = _better_first(verdict)
         seeds = [[values[name][seed] for seed in look.seeds[name]] for name in (one, other)]
         low, share, high = improvement(*seeds)
-        said = [f"a seed of {one} beats one of {other} with {share:.0%} ({low:.0%} to {high:.0%})"]
+        said = [f"A seed of {one} beats one of {other} with {share:.0%} ({low:.0%} to {high:.0%})"]
         if verdict.said == "not decided":
             delta = (plan.delta or 0.0) * (
                 abs(fmean(seeds[1] if plan.baseline == other else map(fmean, seeds))) if plan.relative else 1
@@ -147,13 +150,11 @@ def lost_seeds(facts: Facts) -> Iterator[str]:
 def gaps(facts: Facts) -> Iterator[str]:
     """Name seeds that a group lacks though others have them and it has later ones: left out, perhaps, for a score."""
     seeds = {label: {run.config["seed"] for run in runs} for label, runs in facts.groups.items()}
-    lost = {run.config["seed"] for run in facts.lost}
-    for label, own in seeds.items():
-        if missing := sorted(seed for seed in set().union(*seeds.values()) - own - lost if seed < max(own)):
-            yield (
-                f"{label} goes without seed {listed([str(seed) for seed in missing])}, which others have. If its score "
-                f"is the reason, the error does not hold."
-            )
+    for label, missing in seeds_between(seeds, {run.config["seed"] for run in facts.lost}).items():
+        yield (
+            f"{label} goes without seed {listed([*map(str, missing)])}, which others have. If its score is the reason, "
+            f"the error does not hold."
+        )
 
 
 def equal(facts: Facts) -> Iterator[str]:

@@ -107,9 +107,8 @@ def compare(
         "published_curves": [row for row in curves(component) if row["frames"] <= frames],
         "skipped": [{"run": name, "reason": reason} for name, reason in gathered.skipped.items()],
     }
-    facts = Facts(component, groups, gathered.lost, question.by, answers, tables, frames)
+    facts = Facts(component, groups, gathered.lost, question.by, answers, tables, frames, account.lines)
     caveats, notes = ([line for note in each for line in note(facts)] for each in (CAVEATS, NOTES))
-    caveats = [*account.lines, *caveats]
     if now and answers and all(each.taken is None for each in answers):
         caveats.append("look=now took no look: no undecided group has new seeds, or one has fewer than five.")
     verdict, *others = _sentences(answers, list(groups))

@@ -169,18 +169,15 @@ def _metrics(comparison: Comparison) -> dict[str, float]:
 
 
 def _print(comparison: Comparison) -> None:
+    """Print the scores, what the answers rest on, and last the answers; all else is on the page."""
     console = terminal.console(least=160)
-    for name, title in (("scores", "scores"), ("evaluation", "episodes")):
-        header, *rows = plain(name, comparison.tables[name])
-        table = Table(*header, title=f"{title} after the last step, by {', '.join(comparison.by)}")
-        for column in table.columns[1:]:
-            column.justify = "right"
-        for row in rows:
-            table.add_row(*map(Text, row))
-        console.print(table)
-    for note in comparison.notes:
-        console.print(f"- {note}")
-    console.print()
+    header, *rows = plain("scores", comparison.tables["scores"])
+    table = Table(*header, title=f"scores after the last step, by {', '.join(comparison.by)}")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for row in rows:
+        table.add_row(*map(Text, row))
+    console.print(table)
     for sentence in comparison.caveats:
         console.print(f"- {sentence}")
     for sentence in (*reversed(comparison.others), comparison.verdict):
