@@ -74,6 +74,7 @@ class Account:
     root: str = ""  # the comparison that was continued
     compared: Sequence[str] = ()  # all runs that were ever asked
     lines: Sequence[str] = ()
+    is_warned: bool = False  # whether the lines speak of other questions or of missing runs
 
     def limit(self, asked: Sequence[Family]) -> list[Family]:
         """Return the families with the error that the account leaves them."""
@@ -169,7 +170,7 @@ def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], 
             f"Compared before, and gone or left out now: {listed(gone)}. If their scores are the reason, the error "
             f"does not hold."
         )
-    return Account(record, errors, root, mine.compared, lines)
+    return Account(record, errors, root, mine.compared, lines, is_warned=bool(told or gone))
 
 
 def seeds_between(seeds: Mapping[str, Collection[int]], lost: Collection[int] = ()) -> dict[str, list[int]]:
