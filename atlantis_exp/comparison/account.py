@@ -147,7 +147,10 @@ def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], 
             roots.append(other.root)
             if other.root != mine.name:
                 of = "" if part.of == 1 else f", of whose {part.of} pairs it is a part"
-                lines.append(f"By {family.name}, this continues the looks of {other.name}{of}.")
+                is_open = any(verdict.said == "not decided" for verdict in part.looks[-1].verdicts)
+                is_spent = part.error - sum(look.error for look in part.looks) < 1e-9
+                left = "; to look further, allow a larger error=" if is_open and is_spent else ""
+                lines.append(f"By {family.name}, this continues the looks of {other.name}{of}{left}.")
         else:
             roots.append(mine.root if family.name in errors else mine.name)
     root = roots[0] if len({*roots}) == 1 else mine.name

@@ -72,7 +72,7 @@ def test_a_longer_plan_goes_on_with_the_looks_and_the_error_of_the_shorter_one()
     assert sizes(longer) == [5, 10]
     assert longer.decision.spent == pytest.approx(0.05)
     assert longer.decision.next_look is None
-    assert account.lines == ["By model, this continues the looks of ten."]
+    assert account.lines == ["By model, this continues the looks of ten; to look further, allow a larger error=."]
     dearer, _ = runs.ask("dearer", "ab", range(20), seeds=20, error=0.1)
     assert sizes(dearer) == [5, 10, 20]
     assert dearer.decision.looks[-1].error == pytest.approx(0.05)
