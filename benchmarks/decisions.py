@@ -233,7 +233,7 @@ class Outputs:
         ]
         asked = families(groups, Question(["group"], upto))
         runs = {f"{group}-{seed}" for group, chosen in seeds.items() for seed in chosen}
-        before = self.kept.get(name, Asked(["group"], None, False, None, [[str(each)] * 2 for each in seeds], []))
+        before = self.kept.get(name, Asked(["group"], 0.05, None, False, None, [[str(each)] * 2 for each in seeds], []))
         mine = replace(before, name=name, compared=sorted({*before.compared, *runs}))
         account = open_account(asked, mine, [each for each in self.kept.values() if each.name != name], runs)
         (answered,) = answer(account.limit(asked), account.record, now)

@@ -25,20 +25,25 @@ class Asked:
     """A question that was asked of runs, as its folder keeps it."""
 
     by: list[str]
+    error: float
     delta: float | None
     relative: bool
     baseline: str | None
-    groups: list[list[str]]  # label, then the recipes of its runs: all that they are but for their seeds
+    groups: list[list[str] | str]  # label and the recipes of its runs: all that they are but for their seeds
     compared: list[str]  # all runs that it was ever asked of
     account: str = ""  # the comparison whose looks it continues; empty: its own
     errors: dict[str, float] = field(default_factory=dict)  # of the families that continue one
+    score: str = "last"  # which score of a seed
+    window: float | None = None
+    scores: str = ""  # the table that groups without recipes are from
     name: str = ""
     record: Record = field(default_factory=dict)
 
     @property
     def identities(self) -> dict[str, tuple[str, ...]]:
         """The identity of each group, which no choice of words changes; groups of one recipe have their labels, too."""
-        recipes = {label: tuple(recipes) for label, *recipes in self.groups}
+        rows = [[each, self.scores] if isinstance(each, str) else each for each in self.groups]
+        recipes = {label: tuple(recipes) for label, *recipes in rows}
         if len({*recipes.values()}) == len(recipes):
             return recipes
         return {label: (*of, label) for label, of in recipes.items()}
@@ -48,11 +53,10 @@ class Asked:
         """The comparison whose account it shares."""
         return self.account or self.name
 
-    def means_alike(self, other: "Asked") -> bool:
-        """Return whether a difference that does not matter is the same to both questions."""
-        return (self.delta, self.relative, self.relative and self.baseline) == (
-            *(other.delta, other.relative, other.relative and other.baseline),
-        )
+    @property
+    def measure(self) -> tuple[object, ...]:
+        """Which score it is about, and which difference does not matter."""
+        return self.score, self.window, self.delta, self.relative, self.relative and self.baseline
 
     @property
     def sizes(self) -> set[int]:
@@ -127,7 +131,7 @@ def read_account(
 def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], runs: Collection[str]) -> Account:
     """Return the account of a question.
 
-    Each family takes over the longest looks of an earlier question with the same delta that compared all its pairs, as
+    Each family takes over the longest looks of an earlier question with the same measure and all its pairs, as
     long as they go on from its own. Of what that question has left it may spend the share of its open pairs.
 
     Args:
@@ -210,7 +214,7 @@ class _Part:
 def _part(family: Family, asked: Sequence[Family], mine: Asked, other: Asked) -> _Part | None:
     """Return another question's looks at all pairs of a family; None if there are none that it may continue."""
     source = _source(family, asked, mine, other) if other.record else ""
-    if not (whole := other.record.get(source)) or not mine.means_alike(other):
+    if not (whole := other.record.get(source)) or mine.measure != other.measure:
         return None
     labels = {name: name for name in family.seeds}
     if family is asked[-1]:
@@ -228,7 +232,9 @@ def _part(family: Family, asked: Sequence[Family], mine: Asked, other: Asked) ->
             seeds = {labels[name]: chosen for name, chosen in look.seeds.items() if labels.get(name) in names}
             share = len(verdicts) / len(look.verdicts) if mine.delta is None else len(pairs) / every
             looks.append(Look(seeds, share * look.error, verdicts))
+    # The families of either question share its error, and a part that the other one is has a share of that.
     allowed = family.plan.error * len(asked) / max(len(asked), len(other.record))
+    allowed *= min(1.0, other.errors.get(source, 1.0) * len(other.record) / other.error)
     left = allowed - sum(look.error for look in whole)
     if left < -1e-9:
         return None

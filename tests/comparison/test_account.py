@@ -38,6 +38,7 @@ class Runs:
         before = self.asked.get(name)
         mine = Asked(
             by=["model"],
+            error=asked[0].plan.error,
             delta=asked[0].plan.delta,
             relative=False,
             baseline=None,
@@ -136,6 +137,15 @@ def test_a_pair_of_several_groups_has_their_verdict_and_its_share_of_their_error
     assert (here.difference, here.low, here.high) == pytest.approx((there.difference, there.low, there.high))
 
 
+def test_a_part_in_other_words_has_no_more_error_than_the_part() -> None:
+    runs = Runs()
+    runs.ask("whole", "abcd")
+    runs.ask("pair", "ab", range(8), now=True)
+    other, _ = runs.ask("other", "ab", range(10), words="z")
+    assert sizes(other) == [5, 8, 10]
+    assert other.decision.spent == pytest.approx(0.0125 / 6 + 0.0375 / 3)
+
+
 def test_a_pair_that_may_be_equivalent_has_its_share_of_all_pairs() -> None:
     runs = Runs()
     runs.ask("whole", "abcd", delta=1.0)
@@ -209,12 +219,12 @@ def test_runs_that_were_compared_before_and_are_gone_are_named() -> None:
 
 
 def test_groups_of_one_recipe_are_told_apart_by_their_labels() -> None:
-    asked = Asked([], None, False, None, [["old", "recipe"], ["new", "recipe"]], [])
+    asked = Asked([], 0.05, None, False, None, [["old", "recipe"], ["new", "recipe"]], [])
     assert asked.identities == {"old": ("recipe", "old"), "new": ("recipe", "new")}
 
 
 def test_a_question_about_one_group_has_no_account() -> None:
-    assert open_account([], Asked([], None, False, None, [["a", "x"]], ["a-s0"]), [], ["a-s0"]).lines == ()
+    assert open_account([], Asked([], 0.05, None, False, None, [["a", "x"]], ["a-s0"]), [], ["a-s0"]).lines == ()
 
 
 def test_averages_go_on_where_the_whole_question_is_the_same() -> None:
@@ -226,7 +236,7 @@ def test_averages_go_on_where_the_whole_question_is_the_same() -> None:
         ]
         found: list[Family] = families(groups, Question(["model", "sampler"], seeds=seeds))
         labels = [[group.label, group.label] for group in groups]
-        mine = Asked(["model", "sampler"], None, False, None, labels, ["x"], name=name, record=record)
+        mine = Asked(["model", "sampler"], 0.05, None, False, None, labels, ["x"], name=name, record=record)
         account = open_account(found, mine, others, ["x"])
         answers = answer(account.limit(found), account.record)
         return replace(mine, record={each.family.name: each.decision.looks for each in answers}), account
@@ -236,3 +246,9 @@ def test_averages_go_on_where_the_whole_question_is_the_same() -> None:
     assert account.errors == pytest.approx(dict.fromkeys(("model", "sampler", "model,sampler"), 0.05 / 3))
     assert second.record == first.record
     assert account.root == "first"
+
+
+def test_groups_of_a_table_are_those_of_the_same_table_only() -> None:
+    asked = Asked(["group"], 0.05, None, False, None, ["a", "b"], [], score="file", scores="/x.csv")
+    assert asked.identities == {"a": ("/x.csv", "a"), "b": ("/x.csv", "b")}
+    assert asked.measure != replace(asked, score="training").measure
