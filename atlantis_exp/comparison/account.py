@@ -58,6 +58,10 @@ class Asked:
         """Which score it is about, and which difference does not matter."""
         return self.score, self.window, self.delta, self.relative, self.relative and self.baseline
 
+    def shares_runs(self, other: "Asked") -> bool:
+        """Return whether both were asked of a run, or of the same table."""
+        return bool({*self.compared} & {*other.compared}) or bool(self.scores and self.scores == other.scores)
+
     @property
     def sizes(self) -> set[int]:
         """The numbers of seeds of its looks."""
@@ -163,7 +167,8 @@ def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], 
     told: dict[str, float] = {}  # error spent, by account
     for other in others:
         is_mine = other.root == root and other.sizes <= sizes
-        if other.spent and not is_mine and {*other.compared} & {*mine.compared}:
+        common = {*other.identities.values()} & {*mine.identities.values()}
+        if other.spent and not is_mine and (mine.shares_runs(other) or len(common) > 1):
             told[other.root] = max(told.get(other.root, 0.0), other.spent)
     if told:
         questions = "1 other question" if len(told) == 1 else f"{len(told)} other questions"
@@ -171,7 +176,8 @@ def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], 
         lines.append(
             f"These runs have been asked {questions}, which spent {spent}; the error of this one is on top of it."
         )
-    same = [other for other in others if {*other.identities.values()} == {*mine.identities.values()}]
+    groups = {*mine.identities.values()}
+    same = [other for other in others if {*other.identities.values()} == groups and mine.shares_runs(other)]
     if gone := sorted({*mine.compared}.union(*(other.compared for other in same)) - {*runs}):
         lines.append(
             f"Compared before, and gone or left out now: {listed(gone)}. If their scores are the reason, the error "
@@ -214,7 +220,7 @@ class _Part:
 def _part(family: Family, asked: Sequence[Family], mine: Asked, other: Asked) -> _Part | None:
     """Return another question's looks at all pairs of a family; None if there are none that it may continue."""
     source = _source(family, asked, mine, other) if other.record else ""
-    if not (whole := other.record.get(source)) or mine.measure != other.measure:
+    if not (whole := other.record.get(source)) or mine.measure != other.measure or not mine.shares_runs(other):
         return None
     labels = {name: name for name in family.seeds}
     if family is asked[-1]:

@@ -183,6 +183,15 @@ def test_another_delta_is_another_question_and_is_told() -> None:
     assert account.lines[0].startswith("These runs have been asked 1 other question")
 
 
+def test_other_runs_of_the_same_groups_are_another_question_and_are_told() -> None:
+    runs = Runs()
+    runs.ask("first", "ab")
+    other, account = runs.ask("other", "ab", range(5, 10), words="z")
+    assert other.decision.looks[0].seeds["za"] == [5, 6, 7, 8, 9]
+    assert other.decision.spent == 0.0125
+    assert [line[:42] for line in account.lines] == ["These runs have been asked 1 other questio"]
+
+
 def test_a_smaller_error_than_was_spent_does_not_go_on() -> None:
     runs = Runs()
     runs.ask("loose", "ab", range(10), error=0.5)
