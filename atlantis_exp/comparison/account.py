@@ -29,7 +29,7 @@ class Asked:
     delta: float | None
     relative: bool
     baseline: str | None
-    groups: list[list[str] | str]  # label and the recipes of its runs: all that they are but for their seeds
+    groups: Sequence[list[str] | str]  # label and the recipes of its runs: all that they are but for their seeds
     compared: list[str]  # all runs that it was ever asked of
     account: str = ""  # the comparison whose looks it continues; empty: its own
     errors: dict[str, float] = field(default_factory=dict)  # of the families that continue one
