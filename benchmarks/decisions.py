@@ -370,19 +370,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
         [(shape, percent(share)) for shape, share in watched.items()],
     )
 
-    asked: dict[str, dict[str, float]] = {}
+    askers: dict[str, dict[str, float]] = {}
     for asker, (ask, groups, size) in ASKERS.items():
         folders = [Outputs(values) for values in normal(rng, (count if groups == 2 else count // 4, groups, size))]
         for outputs in folders:
             ask(outputs)
-        asked[asker] = {
+        askers[asker] = {
             "false": float(np.mean([outputs.false for outputs in folders])),
             "silent": float(np.mean([outputs.silent for outputs in folders])),
         }
     print_table(
         "equal groups (normal) asked in several ways: any false verdict, and any without a word of it, in %",
         ("", "false", "without a word"),
-        [(asker, percent(row["false"]), percent(row["silent"])) for asker, row in asked.items()],
+        [(asker, percent(row["false"]), percent(row["silent"])) for asker, row in askers.items()],
     )
 
     single = Plan(looks=(SEEDS,))
@@ -552,14 +552,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "worst_false_decision": max(
                 max(share for users in wrong.values() for share in users.values()),
                 *real.values(),
-                *(row["silent"] for row in asked.values()),
+                *(row["silent"] for row in askers.values()),
             ),
             "worst_shape": {"groups": worst_groups, "looks": worst_plan, "false": shapes[worst_groups][worst_plan]},
             "seeds_to_decide_before": needed["last evaluation"],
             "seeds_to_decide_after": needed["training"],
             "kept_seeds": real,
             "false_decisions": wrong,
-            "asked_in_several_ways": asked,
+            "asked_in_several_ways": askers,
             "watching": watched,
             "power": {cell: [row["power"], row["power_at_ten"]] for cell, row in power.items()},
             "seeds": {cell: row["seeds"] for cell, row in power.items()},
