@@ -11,7 +11,8 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from itertools import combinations_with_replacement, product
+from dataclasses import replace
+from itertools import combinations, combinations_with_replacement, product
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,10 @@ import numpy.typing as npt
 from scipy.special import stdtrit
 from scipy.stats import norm
 
+from atlantis_exp.comparison.account import Asked, open_account, seeds_between
 from atlantis_exp.comparison.decision import Decision, Look, Plan, decide, looks_up_to, mean_interval
 from atlantis_exp.comparison.estimands import TrainingEpisodes, training_score
+from atlantis_exp.comparison.verdict import Group, Question, answer, families
 from benchmarks.contest import print_results, print_table
 
 Values = npt.NDArray[np.float64]
@@ -211,6 +214,97 @@ def coverage_of_means(values: Values, rng: np.random.Generator) -> dict[str, flo
     return {name: float(((low <= 0) & (high >= 0)).mean()) for name, (low, high) in intervals.items()}
 
 
+class Outputs:
+    """Comparisons of the same runs, as an outputs folder keeps them; `false` and `silent` say what they came to.
+
+    Args:
+        values: a row of seeds for each group; all groups have one mean.
+    """
+
+    def __init__(self, values: Values) -> None:
+        self.values, self.kept = values.tolist(), dict[str, Asked]()
+        self.false = False  # any verdict
+        self.silent = False  # any false verdict next to which nothing is said of other questions or of missing seeds
+
+    def ask(self, name: str, seeds: Mapping[int, Sequence[int]], upto: int = SEEDS, now: bool = False) -> Decision:
+        """Ask of some seeds of some groups, in a plan of `upto` seeds; the same name is the same question again."""
+        groups = [
+            Group((str(group),), {seed: self.values[group][seed] for seed in chosen}) for group, chosen in seeds.items()
+        ]
+        asked = families(groups, Question(["group"], upto))
+        runs = {f"{group}-{seed}" for group, chosen in seeds.items() for seed in chosen}
+        before = self.kept.get(name, Asked(["group"], 0.05, None, False, None, [[str(each)] * 2 for each in seeds], []))
+        mine = replace(before, name=name, compared=sorted({*before.compared, *runs}))
+        account = open_account(asked, mine, [each for each in self.kept.values() if each.name != name], runs)
+        (answered,) = answer(account.limit(asked), account.record, now)
+        decision = answered.decision
+        record = {"group": decision.looks}
+        self.kept[name] = replace(mine, record=record, account=account.root, errors=dict(account.errors))
+        is_false = any(verdict.said != "not decided" for verdict in decision.verdicts)
+        self.false |= is_false
+        self.silent |= is_false and not account.is_warned and not seeds_between({str(k): v for k, v in seeds.items()})
+        return decision
+
+
+def longer_plans(outputs: Outputs, plans: Sequence[int] = (10, 20, 40)) -> None:
+    """Prolong the plan until something is decided."""
+    for upto in plans:
+        for size in looks_up_to(upto):
+            outputs.ask(f"{upto}", {0: range(size), 1: range(size)}, upto)
+
+
+def every_plan(outputs: Outputs) -> None:
+    longer_plans(outputs, range(5, 11))
+
+
+def each_pair(outputs: Outputs) -> None:
+    """Ask of all groups, then of each pair."""
+    for groups in (range(len(outputs.values)), *combinations(range(len(outputs.values)), 2)):
+        for size in (5, 10):
+            outputs.ask(f"{groups}", {group: range(size) for group in groups})
+
+
+def best_and_worst(outputs: Outputs) -> None:
+    """Ask of all groups, then of the best and the worst."""
+    for size in (5, 10):
+        outputs.ask("all", {group: range(size) for group in range(len(outputs.values))})
+    means = [float(np.mean(row[:10])) for row in outputs.values]
+    for size in (5, 10):
+        outputs.ask("two", {group: range(size) for group in (means.index(max(means)), means.index(min(means)))})
+
+
+def leave_one_out(outputs: Outputs) -> None:
+    """Ask with ten seeds, then without each of them."""
+    for left_out in (None, *range(10)):
+        seeds = [seed for seed in range(10) if seed != left_out]
+        outputs.ask(f"without {left_out}", {0: seeds, 1: seeds}, now=True)
+
+
+def one_more_group(outputs: Outputs) -> None:
+    """Ask of two groups, then of three, and so on."""
+    for count, size in product(range(2, len(outputs.values) + 1), (5, 10)):
+        outputs.ask(f"{count}", {group: range(size) for group in range(count)})
+
+
+def lowest_deleted(outputs: Outputs) -> None:
+    """Delete the lowest seed of the group that leads, and only then ask."""
+    rows = [row[:10] for row in outputs.values]
+    leader = int(np.mean(rows, axis=1).argmax())
+    lowest = rows[leader].index(min(rows[leader]))
+    outputs.ask("one", {group: [s for s in range(10) if (group, s) != (leader, lowest)] for group in (0, 1)}, now=True)
+
+
+ASKERS: Mapping[str, tuple[Callable[[Outputs], None], int, int]] = {  # with how many groups and seeds
+    "plans of 10, 20 and 40 in turn": (longer_plans, 2, 40),
+    "plans of 5, 6 ... 10 in turn": (every_plan, 2, 10),
+    "eight groups, then each pair": (each_pair, 8, 10),
+    "five groups, then best and worst": (best_and_worst, 5, 10),
+    "a seed left out, ten ways": (leave_one_out, 2, 10),
+    "two groups, then three, four, five": (one_more_group, 5, 10),
+    "the leader's lowest seed deleted": (lowest_deleted, 2, 10),
+}
+
+
 SCORES = ("last evaluation", "training")
 
 
@@ -274,6 +368,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "two equal groups of which something is decided, where the scores say when to ask, in %",
         ("", "watching"),
         [(shape, percent(share)) for shape, share in watched.items()],
+    )
+
+    askers: dict[str, dict[str, float]] = {}
+    for asker, (ask, groups, size) in ASKERS.items():
+        folders = [Outputs(values) for values in normal(rng, (count if groups == 2 else count // 4, groups, size))]
+        for outputs in folders:
+            ask(outputs)
+        askers[asker] = {
+            "false": float(np.mean([outputs.false for outputs in folders])),
+            "silent": float(np.mean([outputs.silent for outputs in folders])),
+        }
+    print_table(
+        "equal groups (normal) asked in several ways: any false verdict, and any without a word of it, in %",
+        ("", "false", "without a word"),
+        [(asker, percent(row["false"]), percent(row["silent"])) for asker, row in askers.items()],
     )
 
     single = Plan(looks=(SEEDS,))
@@ -441,13 +550,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         {
             "simulations": count,
             "worst_false_decision": max(
-                max(share for users in wrong.values() for share in users.values()), *real.values()
+                max(share for users in wrong.values() for share in users.values()),
+                *real.values(),
+                *(row["silent"] for row in askers.values()),
             ),
             "worst_shape": {"groups": worst_groups, "looks": worst_plan, "false": shapes[worst_groups][worst_plan]},
             "seeds_to_decide_before": needed["last evaluation"],
             "seeds_to_decide_after": needed["training"],
             "kept_seeds": real,
             "false_decisions": wrong,
+            "asked_in_several_ways": askers,
             "watching": watched,
             "power": {cell: [row["power"], row["power_at_ten"]] for cell, row in power.items()},
             "seeds": {cell: row["seeds"] for cell, row in power.items()},

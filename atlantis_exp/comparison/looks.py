@@ -1,7 +1,7 @@
 """Keep the record of a comparison's looks, `looks.json` in its folder, which the next look continues."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -14,14 +14,17 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import SMALL, read_file, write_file
 from atlantis_exp.runs.folder import CONFIG, LOOKS
 
-_RECORD = TypeAdapter(dict[str, list[Look]])
+RECORD = TypeAdapter(dict[str, list[Look]])
 
 Record = dict[str, list[Look]]
 """The looks of each family, in order."""
 
 
-def read_looks(folder: Path, families: Sequence[Family]) -> Record:
+def read_looks(folder: Path, families: Sequence[Family], continued: Collection[str] = ()) -> Record:
     """Read the looks taken at some families; empty before the first.
+
+    Args:
+        continued: families that may have looks of an earlier question with another plan.
 
     Raises:
         Fault: if no comparison of these families can have written the file, or a comparison that was made lacks it.
@@ -32,11 +35,11 @@ def read_looks(folder: Path, families: Sequence[Family]) -> Record:
             raise Fault(f"{path} is gone: restore it, for without it the error of the looks in it would be spent again")
         return {}
     try:
-        record = _RECORD.validate_json(read_file(path, SMALL), strict=True)
+        record = RECORD.validate_json(read_file(path, SMALL), strict=True)
         if unknown := record.keys() - {family.name for family in families}:
             raise ValueError(f"it has looks at {min(unknown)!r}")
         for family in families:
-            _check(family, record.get(family.name, []))
+            _check(family, record.get(family.name, []), family.name in continued)
     except (ValueError, OSError) as error:
         reason = "its form is wrong" if isinstance(error, ValidationError) else error
         raise Fault(
@@ -52,7 +55,7 @@ def write_looks(folder: Path, answers: Sequence[Answer]) -> None:
     write_file(folder / LOOKS, json.dumps(record, indent=1).encode())
 
 
-def _check(family: Family, looks: Sequence[Look]) -> None:
+def _check(family: Family, looks: Sequence[Look], is_continued: bool) -> None:
     """Raise ValueError for looks that the family's plan cannot have led to."""
     open_pairs = set(family.plan.pairs(family.seeds))
     size, spent = FEWEST_SEEDS - 1, 0.0
@@ -68,9 +71,11 @@ def _check(family: Family, looks: Sequence[Look]) -> None:
         ):
             raise ValueError(f"its looks by {family.name} are at other pairs")
         sizes |= {verdict.seeds for verdict in look.verdicts}
-        if len(sizes) != 1 or not size < look.size <= family.plan.looks[-1] or not np.isfinite(numbers).all():
+        last = np.inf if is_continued else family.plan.looks[-1]
+        if len(sizes) != 1 or not size < look.size <= last or not np.isfinite(numbers).all():
             raise ValueError(f"its looks by {family.name} are at impossible numbers")
-        if not np.isclose(spent, family.plan.spendable(look.size), rtol=1e-6):
+        planned = family.plan.spendable(look.size)
+        if not (0 < spent <= 1 if is_continued else np.isclose(spent, planned, rtol=1e-6)):
             raise ValueError(f"its looks by {family.name} spent another error than the plan lets them")
         for verdict in look.verdicts:
             found = {"better": verdict.low > 0, "worse": verdict.high < 0, "equivalent": family.plan.delta is not None}

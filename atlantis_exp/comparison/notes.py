@@ -3,21 +3,31 @@
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isclose, nan
-from statistics import fmean
+from statistics import fmean, variance
 
+from atlantis_exp.comparison.account import seeds_between
 from atlantis_exp.comparison.choosing import COMMIT, resolve, values_in
-from atlantis_exp.comparison.decision import condition, equal_scores, modes, size_found
+from atlantis_exp.comparison.decision import (
+    Look,
+    Verdict,
+    condition,
+    equal_scores,
+    improvement,
+    may_be_best,
+    modes,
+    no_worse,
+    seeds_needed,
+    size_found,
+)
 from atlantis_exp.comparison.gather import AXES, StoredRun, Training
 from atlantis_exp.comparison.published import Table, early_dqn, random_line
 from atlantis_exp.comparison.verdict import Answer, Group, Question
-from atlantis_exp.comparison.words import measure
+from atlantis_exp.comparison.words import IN_FULL, listed, margin, measure, spent
 from atlantis_exp.components import Component, facts_of
 from atlantis_exp.runs.folder import LOST
 from atlantis_exp.terminal import PROGRAM
-
-_NAMED = 6  # runs, up to which a line names them
 
 
 @dataclass(frozen=True)
@@ -32,6 +42,7 @@ class Facts:
     answers: Sequence[Answer]
     tables: Mapping[str, Table]
     frames: float  # of the longest training
+    account: Sequence[str] = ()  # what other questions about the runs mean for this one
 
     @property
     def by(self) -> Sequence[str]:
@@ -53,22 +64,75 @@ def by_training(facts: Facts) -> Iterator[str]:
         yield f"The score is {measure(facts.question)}."
 
 
+def stands(facts: Facts) -> Iterator[str]:
+    """Say what each answer rests on: looks, seeds, error, length of training, and other questions."""
+    length = f"; trained for up to {facts.frames:,.0f} frames" if facts.frames else ""
+    for answer in facts.answers:
+        yield f"By {answer.family.name}: {spent(answer)}{length}."
+    yield from facts.account
+
+
 def conditions(facts: Facts) -> Iterator[str]:
     """Say how much each verdict leans on its condition, and how much its difference is overstated."""
+    for _, look, verdict, values in _looked_at(facts):
+        if verdict.said in ("better", "worse"):
+            one, other = _better_first(verdict)
+            found = condition(verdict, look, values)
+            yield (
+                f"{one} against {other}: looks find large differences first; the true one is rather "
+                f"{abs(size_found(verdict, look)):,.0f} points. The error holds for groups whose seeds are spread "
+                f"alike: here by {found.spreads:.1f} times as much in one as in the other, and if "
+                f"{found.undone_by:.0%} of the seeds of {one} collapsed, it would be no better; "
+                f"{verdict.seeds} seeds without a collapse leave up to {found.unseen:.0%} possible."
+            )
+
+
+def further_answers(facts: Facts) -> Iterator[str]:
+    """Say which groups may be best, and of a few pairs how often a seed wins, and what remains possible."""
     for answer in facts.answers:
-        taken = [(look, verdict) for look in answer.decision.looks for verdict in look.verdicts]
-        for look, verdict in taken:
-            pair = (verdict.group, verdict.other) if verdict.said == "better" else (verdict.other, verdict.group)
-            there = all(set(look.seeds[name]) <= answer.family.seeds[name].keys() for name in pair)
-            if verdict.said in ("better", "worse") and there:
-                found = condition(verdict, look, answer.family.seeds)
-                yield (
-                    f"{pair[0]} against {pair[1]}: looks find large differences first; the true one is rather "
-                    f"{abs(size_found(verdict, look)):,.0f} points. The error holds for groups whose seeds are spread "
-                    f"alike: here by {found.spreads:.1f} times as much in one as in the other, and if "
-                    f"{found.undone_by:.0%} of the seeds of {pair[0]} collapsed, it would be no better; "
-                    f"{verdict.seeds} seeds without a collapse leave up to {found.unseen:.0%} possible."
+        plan, verdicts = answer.family.plan, answer.decision.verdicts
+        best = may_be_best(answer.decision)
+        if plan.baseline is None and 1 < len(best) < len(answer.family.seeds):
+            yield f"By {answer.family.name}, with {1 - plan.error:.0%} the best is one of {listed(best)}."
+    for answer, look, verdict, values in _looked_at(facts):
+        plan, verdicts = answer.family.plan, answer.decision.verdicts
+        if len(verdicts) > IN_FULL:
+            continue
+        one, other = _better_first(verdict)
+        seeds = [[values[name][seed] for seed in look.seeds[name]] for name in (one, other)]
+        low, share, high = improvement(*seeds)
+        said = [f"A seed of {one} beats one of {other} with {share:.0%} ({low:.0%} to {high:.0%})"]
+        if verdict.said == "not decided":
+            delta = (plan.delta or 0.0) * (
+                abs(fmean(seeds[1] if plan.baseline == other else map(fmean, seeds))) if plan.relative else 1
+            )
+            turned = replace(verdict, low=-verdict.high)
+            said += [
+                f"{name} is no worse by more than {margin(plan)}"
+                for name, of in ((verdict.group, verdict), (verdict.other, turned))
+                if delta and no_worse(of, delta)
+            ]
+            spread = fmean(map(variance, seeds)) ** 0.5
+            if spread and verdict.difference:
+                needed = seeds_needed(verdict.difference, spread, plan.error, len(verdicts))
+                said.append(
+                    f"a difference of this size takes {needed or 'more than 1,000'} seeds each to be found with 80 %"
                 )
+        yield f"{'; '.join(said)}."
+
+
+def _looked_at(facts: Facts) -> Iterator[tuple[Answer, Look, Verdict, dict[str, dict[int, float]]]]:
+    """Yield the last verdict of each pair with its look and the families' values, where the look's seeds are there."""
+    for answer in facts.answers:
+        last = {(of.group, of.other): (look, of) for look in answer.decision.looks for of in look.verdicts}
+        for pair, (look, verdict) in last.items():
+            if all({*look.seeds[name]} <= answer.family.seeds[name].keys() for name in pair):
+                yield answer, look, verdict, answer.family.seeds
+
+
+def _better_first(verdict: Verdict) -> tuple[str, str]:
+    pair = verdict.group, verdict.other
+    return pair if verdict.difference > 0 else pair[::-1]
 
 
 def collapsed(facts: Facts) -> Iterator[str]:
@@ -77,7 +141,7 @@ def collapsed(facts: Facts) -> Iterator[str]:
         if names := [run.name for run in runs if run.has_collapsed]:
             yield (
                 f"{len(names)} of {len(runs)} runs of {label} collapsed to one action, so their scores say little of "
-                f"learning: {_listed(names)}."
+                f"learning: {listed(names)}."
             )
 
 
@@ -91,7 +155,17 @@ def lost_seeds(facts: Facts) -> Iterator[str]:
     for label, missing in names.items():
         yield (
             f"{label} lacks {len(missing)} {'seed' if len(missing) == 1 else 'seeds'}, unfinished or unusable: "
-            f"{_listed(missing)}. If how it played is the reason, the others do not stand for it."
+            f"{listed(missing)}. If how it played is the reason, the others do not stand for it."
+        )
+
+
+def gaps(facts: Facts) -> Iterator[str]:
+    """Name seeds that a group lacks though others have them and it has later ones: left out, perhaps, for a score."""
+    seeds = {label: {run.config["seed"] for run in runs} for label, runs in facts.groups.items()}
+    for label, missing in seeds_between(seeds, {run.config["seed"] for run in facts.lost}).items():
+        yield (
+            f"{label} goes without seed {listed([*map(str, missing)])}, which others have. If its score is the reason, "
+            f"the error does not hold."
         )
 
 
@@ -103,7 +177,7 @@ def equal(facts: Facts) -> Iterator[str]:
         alike[tuple(dict.fromkeys(label_of[name] for name in names))].extend(names)
     for labels, names in alike.items():
         has = "has" if len(labels) == 1 else "have"
-        yield f"{' and '.join(labels)} {has} runs with the same score in every episode: {_listed(names)}."
+        yield f"{' and '.join(labels)} {has} runs with the same score in every episode: {listed(names)}."
 
 
 def modes_found(facts: Facts) -> Iterator[str]:
@@ -145,21 +219,21 @@ def unlike(facts: Facts) -> Iterator[str]:
         for run in runs:
             holders[value(run)].append(run.name)
         if len(holders) > 1:
-            named = "; ".join(f"{value}: {_listed(names)}" for value, names in sorted(holders.items()))
+            named = "; ".join(f"{value}: {listed(names)}" for value, names in sorted(holders.items()))
             yield f"The runs were {how}: {named}."
 
 
 def lossy(facts: Facts) -> Iterator[str]:
     """Name runs that went on without a part of their replay memory."""
     if names := [run.name for run in facts.trainings if LOST in run.tags]:
-        yield f"Went on without a part of their replay memory, which was damaged: {_listed(names)}."
+        yield f"Went on without a part of their replay memory, which was damaged: {listed(names)}."
 
 
 def uncommitted(facts: Facts) -> Iterator[str]:
     """Name runs of code that no commit holds, if commits are compared."""
     names = [run.name for run in facts.trainings if run.tags.get("git.dirty") == "true"]
     if COMMIT in facts.by and names:
-        yield f"Made with changes that their commit does not hold: {_listed(names)}."
+        yield f"Made with changes that their commit does not hold: {listed(names)}."
 
 
 def unbalanced(facts: Facts) -> Iterator[str]:
@@ -169,7 +243,7 @@ def unbalanced(facts: Facts) -> Iterator[str]:
         if family.left_out:
             yield (
                 f"By {family.name}, groups without a counterpart for every value are left out: "
-                f"{_listed(family.left_out)}."
+                f"{listed(family.left_out)}."
             )
         for value, members in family.groups.items():
             if members and (alone := set.union(*(set(group.seeds) for group in members)) - family.seeds[value].keys()):
@@ -195,7 +269,7 @@ def later_seeds(facts: Facts) -> Iterator[str]:
     if late:
         yield (
             "Verdicts rest on the seeds of their looks, scores are of all seeds there are: "
-            f"{_listed([f'{value} has {seeds}' for value, seeds in late.items()])}."
+            f"{listed([f'{value} has {seeds}' for value, seeds in late.items()])}."
         )
 
 
@@ -215,7 +289,7 @@ def moved_seeds(facts: Facts) -> Iterator[str]:
         if moved := [pair for pair, is_so in stands.items() if not is_so]:
             yield (
                 f"By {answer.family.name}, runs of past looks are gone or have other scores now, and their verdicts "
-                f"stay: {_listed(moved)}."
+                f"stay: {listed(moved)}."
             )
 
 
@@ -261,7 +335,7 @@ def begun(facts: Facts) -> Iterator[str]:
     """Name the weights that trainings began with."""
     for label, runs in facts.groups.items():
         if weights := dict.fromkeys(str(run.config[key]) for run in runs if run.config.get(key := "training.weights")):
-            yield f"{label} began with {_listed([*weights])}; what that took counts in no frames, hours or arithmetic."
+            yield f"{label} began with {listed([*weights])}; what that took counts in no frames, hours or arithmetic."
 
 
 def survival_and_rate(facts: Facts) -> Iterator[str]:
@@ -316,7 +390,8 @@ def random_player(facts: Facts) -> Iterator[str]:
 
 
 CAVEATS: Sequence[Note] = (
-    *(by_training, conditions, collapsed, lost_seeds, equal, modes_found, unlike, lossy, uncommitted),
+    *(stands, by_training, further_answers, conditions, collapsed, lost_seeds, gaps, equal, modes_found, unlike, lossy),
+    uncommitted,
     *(unbalanced, later_seeds, moved_seeds),
 )
 """What may make a verdict mean something else."""
@@ -326,11 +401,6 @@ NOTES: Sequence[Note] = (
     *(capped, measured_players, random_player),
 )
 """What is said after it."""
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = len(names) - _NAMED
-    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _values(keys: Mapping[str, Sequence[str]]) -> str:

@@ -13,10 +13,10 @@ from typing import Literal
 import numpy as np
 
 from atlantis_exp import documents
+from atlantis_exp.comparison.account import Account
 from atlantis_exp.comparison.choosing import plays_alike
 from atlantis_exp.comparison.decision import (
     FEWEST_SEEDS,
-    Look,
     Plan,
     Verdict,
     decide,
@@ -95,21 +95,22 @@ def compare(
     gathered: Gathered,
     groups: Groups,
     question: Question,
-    record: Mapping[str, Sequence[Look]] | None = None,
+    account: Account | None = None,
     now: bool = False,
     scored: Sequence[Group] = (),
 ) -> Comparison:
     """Compare groups of trainings, taking the looks that are due, or with `now` one that is not.
 
     Args:
-        record: the looks taken before, by family.
+        account: the looks taken before, and the error that is left.
         scored: groups of seeds that have scores and nothing else, in place of trainings.
 
     Raises:
         ConfigError: if the baseline is not among what is compared.
     """
+    account = account or Account()
     seeds_of = scored or [group_of(runs, question.by) for runs in groups.values()]
-    answers = answer(families(seeds_of, question), record or {}, now)
+    answers = answer(account.limit(families(seeds_of, question)), account.record, now)
     trainings = [training for runs in groups.values() for training in runs]
     component = trainings[0].game if trainings else None
     game = facts_of(component)
@@ -148,7 +149,7 @@ def compare(
         "published_curves": [row for row in curves(component) if row["frames"] <= frames],
         "skipped": [{"run": name, "reason": reason} for name, reason in gathered.skipped.items()],
     }
-    facts = Facts(component, groups, gathered.lost, question, seeds_of, answers, tables, frames)
+    facts = Facts(component, groups, gathered.lost, question, seeds_of, answers, tables, frames, account.lines)
     caveats, notes = ([line for note in each for line in note(facts)] for each in (CAVEATS, NOTES))
     if now and answers and all(each.taken is None for each in answers):
         caveats.append("look=now took no look: no undecided group has new seeds, or one has fewer than five.")

@@ -8,8 +8,8 @@ import numpy as np
 from atlantis_exp.comparison.decision import Plan, Verdict
 from atlantis_exp.comparison.verdict import Answer, Question
 
-_IN_FULL = 3  # pairs of a family, up to which each is said with its interval
-_LISTED = 6  # undecided pairs, up to which they are named
+IN_FULL = 3  # pairs of a family, up to which each is said with its interval
+_LISTED = 6  # undecided pairs or runs, up to which they are named
 
 
 def measure(question: Question) -> str:
@@ -30,7 +30,7 @@ def measure(question: Question) -> str:
 def said(answer: Answer) -> str:
     """Say what is decided and what is not; the better ones come first."""
     verdicts = answer.decision.verdicts
-    in_full = len(verdicts) <= _IN_FULL
+    in_full = len(verdicts) <= IN_FULL
     baseline = answer.family.plan.baseline
     better: dict[tuple[str, str], list[str]] = defaultdict(list)
     for verdict in verdicts:
@@ -54,7 +54,7 @@ def said(answer: Answer) -> str:
 
 
 def _undecided(answer: Answer, verdicts: Sequence[Verdict]) -> str:
-    decision, in_full = answer.decision, len(answer.decision.verdicts) <= _IN_FULL
+    decision, in_full = answer.decision, len(answer.decision.verdicts) <= IN_FULL
     if len(verdicts) > _LISTED:
         text = f"Not decided: {len(verdicts)} of {len(decision.verdicts)} pairs"
     else:
@@ -95,6 +95,12 @@ def margin(plan: Plan) -> str:
     if plan.delta is None:
         return ""
     return f"{100 * plan.delta:g} %" if plan.relative else f"{_points(plan.delta)} points"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names in a row, the first few of many."""
+    more = len(names) - _LISTED
+    return ", ".join(names[:_LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _gap(verdict: Verdict, other: str, in_full: bool, turned: bool) -> str:

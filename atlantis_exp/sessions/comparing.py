@@ -14,6 +14,7 @@ from rich.text import Text
 from atlantis_exp import terminal
 from atlantis_exp.checking import digest, flatten
 from atlantis_exp.comparison import tables
+from atlantis_exp.comparison.account import read_account
 from atlantis_exp.comparison.choosing import (
     COMMIT,
     group,
@@ -28,11 +29,10 @@ from atlantis_exp.comparison.estimands import by_training
 from atlantis_exp.comparison.export_tables import to_latex, with_units
 from atlantis_exp.comparison.figures import Drawn, draw
 from atlantis_exp.comparison.gather import Gathered, Player, Training, gather, refuse_unknown
-from atlantis_exp.comparison.looks import read_looks, write_looks
+from atlantis_exp.comparison.looks import write_looks
 from atlantis_exp.comparison.page import page, plain
 from atlantis_exp.comparison.tables import Comparison
 from atlantis_exp.comparison.verdict import Question, families, group_of, worse_than_baseline
-from atlantis_exp.comparison.words import spent
 from atlantis_exp.config import TrackingConfig
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
@@ -101,14 +101,14 @@ def compare(
         "atlantis.kind": "comparison",
     }
     with folder.held():
-        record = read_looks(folder.path, asked)
+        account = read_account(folder, asked, identity, [training.name for training in trainings])
         with terminal.working("computing the tables"):
-            comparison = tables.compare(gathered, groups, question, record, look_now, scored)
+            comparison = tables.compare(gathered, groups, question, account, look_now, scored)
         write_looks(folder.path, comparison.answers)
         with terminal.working("drawing the figures"):
             figures = draw(comparison)
         with publishing(folder, tracking, outputs, labels) as journal:
-            folder.write_config(facts := {**identity, "compared": [training.name for training in trainings]})
+            folder.write_config(facts := {**identity, **account.kept})
             journal.params({key: str(value) for key, value in flatten(facts).items()})
             _write(journal, comparison, figures, provenance(command), compared)
     _print(comparison)
@@ -188,22 +188,15 @@ def _metrics(comparison: Comparison) -> dict[str, float]:
 
 
 def _print(comparison: Comparison) -> None:
+    """Print the scores, what the answers rest on, and last the answers; all else is on the page."""
     console = terminal.console(least=160)
-    for name, title in (("scores", "scores"), ("evaluation", "episodes after the last step")):
-        if not comparison.tables[name]:
-            continue
-        header, *rows = plain(name, comparison.tables[name])
-        table = Table(*header, title=f"{title} by {', '.join(comparison.by)}")
-        for column in table.columns[1:]:
-            column.justify = "right"
-        for row in rows:
-            table.add_row(*map(Text, row))
-        console.print(table)
-    for note in comparison.notes:
-        console.print(f"- {note}")
-    console.print()
-    for each in comparison.answers:
-        console.print(f"By {each.family.name}: {spent(each)}.")
+    header, *rows = plain("scores", comparison.tables["scores"])
+    table = Table(*header, title=f"scores by {', '.join(comparison.by)}")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for row in rows:
+        table.add_row(*map(Text, row))
+    console.print(table)
     for sentence in comparison.caveats:
         console.print(f"- {sentence}")
     for sentence in (*reversed(comparison.others), comparison.verdict):

@@ -50,3 +50,30 @@ def test_whoever_asks_after_every_seed_gets_the_verdicts_of_whoever_trains_as_ad
     values = decisions.bimodal(np.random.default_rng(0), (20, 3, decisions.SEEDS))
     for groups in values + np.array([[0.0], [0.5], [1.5]]):
         assert decisions.advised(groups, plan) == decisions.one_by_one(groups, plan)
+
+
+@pytest.mark.parametrize(
+    "asker", ["plans of 5, 6 ... 10 in turn", "a seed left out, ten ways", "five groups, then best and worst"]
+)
+def test_whoever_asks_again_about_the_same_runs_is_told_what_the_first_question_found(asker: str) -> None:
+    ask, groups, size = decisions.ASKERS[asker]
+    for values in decisions.normal(np.random.default_rng(1), (6, groups, size)):
+        outputs = decisions.Outputs(values)
+        ask(outputs)
+        found, *others = (
+            {(of.group, of.other): of.said for look in asked.record["group"] for of in look.verdicts}
+            for asked in outputs.kept.values()
+        )
+        assert len(others) == {"a": 10, "f": 1, "p": 5}[asker[0]]
+        assert all(other.items() <= found.items() for other in others)
+
+
+def test_a_lowest_seed_that_is_deleted_is_missed_unless_it_has_the_highest_number() -> None:
+    ask, *_ = decisions.ASKERS["the leader's lowest seed deleted"]
+    values = np.arange(20.0).reshape(2, 10) / 100 + np.array([[0.0], [9.0]])
+    outputs = decisions.Outputs(values)
+    ask(outputs)
+    assert (outputs.false, outputs.silent) == (True, False)
+    outputs = decisions.Outputs(values[:, ::-1])
+    ask(outputs)
+    assert (outputs.false, outputs.silent) == (True, True)

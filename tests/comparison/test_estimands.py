@@ -125,7 +125,7 @@ def test_a_table_with_impossible_numbers_is_refused(row: str, tmp_path: Path) ->
 
 def of_kept(tmp_path: Path, names: list[str], folder: str = "verdict") -> Path:
     for name in names:
-        shutil.copytree(DOCS / folder / "runs" / name, tmp_path / "runs" / name)
+        shutil.copytree(RESULTS / folder / "runs" / name, tmp_path / "runs" / name)
     return tmp_path
 
 

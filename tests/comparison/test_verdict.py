@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from atlantis_exp.commands.compare import VERB
+from atlantis_exp.comparison.account import Account
 from atlantis_exp.comparison.choosing import PROTOCOL, group
 from atlantis_exp.comparison.decision import Look, mean_interval
 from atlantis_exp.comparison.figures import draw
@@ -86,7 +87,7 @@ def compared(
 ) -> Comparison:
     """What the comparison of some runs by some keys, or by model, says."""
     by = by or ("model",)
-    return compare(Gathered(list(runs)), group(runs, by), Question(by, **question), record, now)
+    return compare(Gathered(list(runs)), group(runs, by), Question(by, **question), Account(record or {}), now)
 
 
 def record_of(comparison: Comparison) -> dict[str, list[Look]]:
@@ -637,6 +638,27 @@ def test_a_worse_commit_ends_with_exit_code_1_and_one_line(record_seeds: Callabl
         assert f"baseline={other}: no such group" in run("by=git.commit", f"baseline={other}", code=2)
 
 
+@pytest.mark.usefixtures("_undrawn")
+def test_runs_that_were_asked_before_go_on_with_their_looks_and_are_told_of_other_questions(
+    record_seeds: Callable[..., list[Path]], run: Run, tmp_path: Path
+) -> None:
+    for model, score in (("cnn", 3_000.0), ("resnet", 3_015.0), ("resnet_fast", 9_000.0)):
+        first, *_ = record_seeds(model, score)
+    assert "have been asked" not in run("runs=cnn,resnet-", "seeds=5")
+    shown = run("runs=resnet-,cnn", "seeds=20")
+    assert "By model, this continues the looks of cnn-vs-resnet-" in shown
+    assert "5.00% of 5.00%" in shown
+    assert "These runs have been asked 1 other question, which spent 5.00%;" in (whole := run())
+    shutil.rmtree(first)
+    assert f"Compared before, and gone or left out now: {first.name}." in run()
+    assert "of whose 3 pairs it is a part" in run("runs=cnn,resnet_fast")
+    assert "cannot be read" not in whole
+    broken = next((tmp_path / "comparisons").glob("cnn-vs-resnet-vs-*")) / "looks.json"
+    broken.write_text("{}"[:1])
+    assert f"cannot be read: {broken.parent.name}." in run("runs=cnn,resnet-")
+    assert run(code=1).startswith(f"atlantis_exp: {broken} is no record")
+
+
 OLD, NEW = "0123456789abcdef0123456789abcdef01234567", "fedcba9876543210fedcba9876543210fedcba98"
 
 
@@ -765,3 +787,56 @@ def test_a_verdict_says_its_condition_and_its_size_where_a_look_found_it() -> No
     assert "if 5% of the seeds of a collapsed, it would be no better" in line
     assert re.search(r"1\.0 times as much .* leave up to (26|45)% possible", line)
     assert not [note for note in compared(around("a", 1_000) + around("b", 1_000)).caveats if "collapsed" in note]
+
+
+def test_under_the_verdict_stand_its_looks_its_error_and_the_length_of_training() -> None:
+    runs = [*around("a", 1_000), *around("b", 950)]
+    curve = {key: np.array([0.0, 4e6]) for key in ("frames", "hours", "epsilon", "score")}
+    lines = [
+        compared([replace(run, curve=curve) for run in runs], error=error).caveats[0] for error in (Question.error, 0.9)
+    ]
+    for line, error in zip(lines, ("1.25% of 5.00%", "22.50% of 90.00%"), strict=True):
+        assert line.startswith("By model: looks planned at 5 and 10 seeds; taken: 5; error spent: ")
+        assert line.endswith(f"{error}; trained for up to 4,000,000 frames.")
+
+
+def test_of_several_groups_those_that_may_be_best_are_named_where_some_cannot_be() -> None:
+    runs = [*around("a", 1_000), *around("b", 1_003), *around("c", 100)]
+    assert "By model, with 95% the best is one of a, b." in compared(runs).caveats
+    for others in (runs[:10] + around("c", 1_001), runs[5:], runs[:5]):
+        assert not [line for line in compared(others).caveats if "the best is one of" in line]
+    assert not [line for line in compared(runs, baseline="a").caveats if "the best is one of" in line]
+
+
+def test_an_open_pair_says_how_often_a_seed_wins_and_the_seeds_that_such_a_difference_takes() -> None:
+    (line,) = (line for line in compared([*around("a", 1_000), *around("b", 1_015)]).caveats if "A seed of" in line)
+    beats = r"A seed of b beats one of a with (\d+)% \((\d+)% to (\d+)%\)"
+    found = re.match(rf"{beats}; a difference of this size takes (\d+) seeds each to be found with 80 %\.$", line)
+    assert found
+    share, low, high, seeds = map(int, found.groups())
+    assert share > 50
+    assert low < share < high
+    assert 20 < seeds < 60  # 0.61 of a standard deviation
+    decided = compared([*around("a", 1_000), *around("b", 1_915)]).caveats
+    assert any(re.match(rf"{beats}\.$", line) for line in decided)
+
+
+def test_an_open_pair_says_which_group_is_no_worse_by_more_than_delta() -> None:
+    runs = [*around("a", 1_000), *around("b", 1_040)]
+
+    def said(**question: Any) -> list[str]:
+        caveats = compared(runs, error=0.01, **question).caveats
+        return [part for line in caveats for part in line.rstrip(".").split("; ") if "no worse by" in part]
+
+    assert said() == []
+    assert said(delta=60.0) == ["b is no worse by more than 60 points"]
+    assert said(delta=0.06, relative=True) == ["b is no worse by more than 6 %"]
+    assert said(delta=0.06, relative=True, baseline="b") == ["b is no worse by more than 6 %"]
+    assert said(delta=5.0) == []
+    assert said(delta=0.005, relative=True) == []
+
+
+def test_a_seed_that_one_group_lacks_below_its_others_is_named() -> None:
+    runs = [*around("a", 1_000, (0, 1, 3, 4, 5)), *around("b", 1_000, range(8))]
+    (line,) = (line for line in compared(runs).caveats if "goes without seed" in line)
+    assert line.startswith("a goes without seed 2, which others have.")

@@ -20,7 +20,7 @@ from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.training import train
 
 Recorded = Callable[..., Path]
-KEPT = Path(__file__).parents[2] / "docs" / "verdict"
+KEPT = Path(__file__).parents[2] / "results" / "verdict"
 DECISION = "decide-7cfff86226"  # cnn against resnet_fast, ten seeds each
 LOOKS = json.loads((KEPT / "comparisons" / "cnn-vs-resnet-fast-e09e14bb20" / "looks.json").read_text())
 

@@ -1,0 +1,272 @@
+"""Keep one account of error for runs, however a question about them is put.
+
+It is read from the folders of all comparisons under an outputs folder: `config.json` says what each compared,
+`looks.json` what its looks found and spent. A question continues the looks of an earlier one that compared its pairs of
+groups, alone or among others, and is told what other questions about any of its runs have spent.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from pydantic import TypeAdapter
+
+from atlantis_exp.comparison.decision import Look, Verdict
+from atlantis_exp.comparison.gather import UNREADABLE
+from atlantis_exp.comparison.looks import RECORD, Record, read_looks
+from atlantis_exp.comparison.verdict import Family
+from atlantis_exp.comparison.words import listed
+from atlantis_exp.runs.files import SMALL, read_file
+from atlantis_exp.runs.folder import LOOKS, RunFolder
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A question that was asked of runs, as its folder keeps it."""
+
+    by: list[str]
+    error: float
+    delta: float | None
+    relative: bool
+    baseline: str | None
+    groups: Sequence[list[str] | str]  # label and the recipes of its runs: all that they are but for their seeds
+    compared: list[str]  # all runs that it was ever asked of
+    account: str = ""  # the comparison whose looks it continues; empty: its own
+    errors: dict[str, float] = field(default_factory=dict)  # of the families that continue one
+    score: str = "last"  # which score of a seed
+    window: float | None = None
+    scores: str = ""  # the table that groups without recipes are from
+    name: str = ""
+    record: Record = field(default_factory=dict)
+
+    @property
+    def identities(self) -> dict[str, tuple[str, ...]]:
+        """The identity of each group, which no choice of words changes; groups of one recipe have their labels, too."""
+        rows = [[each, self.scores] if isinstance(each, str) else each for each in self.groups]
+        recipes = {label: tuple(recipes) for label, *recipes in rows}
+        if len({*recipes.values()}) == len(recipes):
+            return recipes
+        return {label: (*of, label) for label, of in recipes.items()}
+
+    @property
+    def root(self) -> str:
+        """The comparison whose account it shares."""
+        return self.account or self.name
+
+    @property
+    def measure(self) -> tuple[object, ...]:
+        """Which score it is about, and which difference does not matter."""
+        return self.score, self.window, self.delta, self.relative, self.relative and self.baseline
+
+    def shares_runs(self, other: "Asked") -> bool:
+        """Return whether both were asked of a run, or of the same table."""
+        return bool({*self.compared} & {*other.compared}) or bool(self.scores and self.scores == other.scores)
+
+    @property
+    def sizes(self) -> set[int]:
+        """The numbers of seeds of its looks."""
+        return {look.size for looks in self.record.values() for look in looks}
+
+    @property
+    def spent(self) -> float:
+        """The error that its looks spent."""
+        return sum(look.error for looks in self.record.values() for look in looks)
+
+
+@dataclass(frozen=True)
+class Account:
+    """What a question may still spend, and what must be said of it."""
+
+    record: Mapping[str, Sequence[Look]] = field(default_factory=dict)
+    errors: Mapping[str, float] = field(default_factory=dict)  # of families that continue an earlier one
+    root: str = ""  # the comparison that was continued
+    compared: Sequence[str] = ()  # all runs that were ever asked
+    lines: Sequence[str] = ()
+    is_warned: bool = False  # whether the lines speak of other questions or of missing runs
+
+    def limit(self, asked: Sequence[Family]) -> list[Family]:
+        """Return the families with the error that the account leaves them."""
+        return [
+            replace(family, plan=replace(family.plan, error=self.errors.get(family.name, family.plan.error)))
+            for family in asked
+        ]
+
+    @property
+    def kept(self) -> dict[str, Any]:
+        """What the comparison's folder keeps of it."""
+        continued = {"account": self.root, "errors": dict(self.errors)} if self.errors else {}
+        return {"compared": list(self.compared), **continued}
+
+
+def read_account(
+    folder: RunFolder, asked: Sequence[Family], question: Mapping[str, Any], runs: Sequence[str]
+) -> Account:
+    """Return the account of a question, read from all comparisons next to its folder.
+
+    Raises:
+        Fault: if the folder's own looks are damaged or gone.
+    """
+    others, damaged = [], []
+    for path in sorted(folder.path.parent.glob(f"*/{LOOKS}")):
+        if path.parent != folder.path:
+            other = RunFolder(path.parent)
+            try:
+                others.append(replace(_read(other), record=RECORD.validate_json(read_file(path, SMALL), strict=True)))
+            except UNREADABLE:
+                damaged.append(other.name)
+    try:
+        before = _read(folder)
+        loose: Collection[str] = before.errors
+    except UNREADABLE:  # before its first look, or killed while it wrote
+        before, loose = _ASKED.validate_python({**question, "compared": []}), {family.name for family in asked}
+    mine = replace(
+        before,
+        name=folder.name,
+        compared=sorted({*before.compared, *runs}),
+        record=read_looks(folder.path, asked, loose),
+    )
+    found = open_account(asked, mine, others, runs)
+    if damaged:
+        line = f"What these comparisons spent is unknown, since they cannot be read: {listed(damaged)}."
+        found = replace(found, lines=[*found.lines, line])
+    return found
+
+
+def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], runs: Collection[str]) -> Account:
+    """Return the account of a question.
+
+    Each family takes over the longest looks of an earlier question with the same measure and all its pairs, as
+    long as they go on from its own. Of what that question has left it may spend the share of its open pairs.
+
+    Args:
+        mine: the question, with its own looks so far and all runs that it was ever asked of.
+        runs: those that it is asked of now.
+    """
+    if not asked:
+        return Account(compared=mine.compared)
+    record, errors, roots, lines = dict(mine.record), dict(mine.errors), [], []
+    for family in asked:
+        own = mine.record.get(family.name, [])
+        parts = [(part, other) for other in others if (part := _part(family, asked, mine, other)) is not None]
+        parts = [(part, other) for part, other in parts if part.looks[: len(own)] == own]
+        if parts:
+            part, other = max(parts, key=lambda found: len(found[0].looks))
+            record[family.name], errors[family.name] = part.looks, part.error
+            roots.append(other.root)
+            if other.root != mine.name:
+                of = "" if part.of == 1 else f", of whose {part.of} pairs it is a part"
+                is_open = any(verdict.said == "not decided" for verdict in part.looks[-1].verdicts)
+                is_spent = part.error - sum(look.error for look in part.looks) < 1e-9
+                left = "; to look further, allow a larger error=" if is_open and is_spent else ""
+                lines.append(f"By {family.name}, this continues the looks of {other.name}{of}{left}.")
+        else:
+            roots.append(mine.root if family.name in errors else mine.name)
+    root = roots[0] if len({*roots}) == 1 else mine.name
+    sizes = {look.size for looks in record.values() for look in looks}  # and those that it will look at
+    sizes |= {size for family in asked for size in family.plan.looks if size > max(sizes, default=0)}
+    told: dict[str, float] = {}  # error spent, by account
+    for other in others:
+        is_mine = other.root == root and other.sizes <= sizes
+        common = {*other.identities.values()} & {*mine.identities.values()}
+        if other.spent and not is_mine and (mine.shares_runs(other) or len(common) > 1):
+            told[other.root] = max(told.get(other.root, 0.0), other.spent)
+    if told:
+        questions = "1 other question" if len(told) == 1 else f"{len(told)} other questions"
+        spent = f"{sum(told.values()):.2%}"
+        lines.append(
+            f"These runs have been asked {questions}, which spent {spent}; the error of this one is on top of it."
+        )
+    groups = {*mine.identities.values()}
+    same = [other for other in others if {*other.identities.values()} == groups and mine.shares_runs(other)]
+    if gone := sorted({*mine.compared}.union(*(other.compared for other in same)) - {*runs}):
+        lines.append(
+            f"Compared before, and gone or left out now: {listed(gone)}. If their scores are the reason, the error "
+            f"does not hold."
+        )
+    return Account(record, errors, root, mine.compared, lines, is_warned=bool(told or gone))
+
+
+def seeds_between(seeds: Mapping[str, Collection[int]], lost: Collection[int] = ()) -> dict[str, list[int]]:
+    """Return the seeds that groups lack although others have them and they have later ones, but for lost ones."""
+    every = {seed for own in seeds.values() for seed in own} - {*lost}
+    missing = {label: sorted(seed for seed in every - {*own} if seed < max(own)) for label, own in seeds.items()}
+    return {label: found for label, found in missing.items() if found}
+
+
+_ASKED = TypeAdapter(Asked)
+
+
+def _read(folder: RunFolder) -> Asked:
+    return replace(_ASKED.validate_python(folder.config), name=folder.name)
+
+
+def _source(family: Family, asked: Sequence[Family], mine: Asked, other: Asked) -> str:
+    """Return the name of another question's family that compares the same; empty if none is known to."""
+    if family is asked[-1]:  # all groups
+        return [*other.record][-1]
+    same = mine.by == other.by and mine.identities == other.identities
+    return family.name if same and family.name in other.record else ""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """The looks of another question at a family's pairs."""
+
+    looks: list[Look]
+    error: float  # that the family has, spent and left
+    of: int  # pairs of the other question; 1: it has no other ones
+
+
+def _part(family: Family, asked: Sequence[Family], mine: Asked, other: Asked) -> _Part | None:
+    """Return another question's looks at all pairs of a family; None if there are none that it may continue."""
+    source = _source(family, asked, mine, other) if other.record else ""
+    if not (whole := other.record.get(source)) or mine.measure != other.measure or not mine.shares_runs(other):
+        return None
+    labels = {name: name for name in family.seeds}
+    if family is asked[-1]:
+        own = {identity: label for label, identity in mine.identities.items()}
+        labels = {label: own[identity] for label, identity in other.identities.items() if identity in own}
+    pairs, every = family.plan.pairs(family.seeds), len(whole[0].verdicts)
+    looks: list[Look] = []
+    for look in whole:
+        renamed = [_renamed(verdict, labels, pairs) for verdict in look.verdicts]
+        verdicts = [verdict for verdict in renamed if verdict is not None]
+        if not looks and len(verdicts) < len(pairs):
+            return None
+        if verdicts:
+            names = {name for verdict in verdicts for name in (verdict.group, verdict.other)}
+            seeds = {labels[name]: chosen for name, chosen in look.seeds.items() if labels.get(name) in names}
+            share = len(verdicts) / len(look.verdicts) if mine.delta is None else len(pairs) / every
+            looks.append(Look(seeds, share * look.error, verdicts))
+    # The families of either question share its error, and a part that the other one is has a share of that.
+    allowed = family.plan.error * len(asked) / max(len(asked), len(other.record))
+    allowed *= min(1.0, other.errors.get(source, 1.0) * len(other.record) / other.error)
+    left = allowed - sum(look.error for look in whole)
+    if left < -1e-9:
+        return None
+    # As at the other question's next look, its open pairs share what is left; with delta all of its pairs do.
+    still, of_all = (sum(verdict.said == "not decided" for verdict in each[-1].verdicts) for each in (looks, whole))
+    share = len(pairs) / every if mine.delta is not None or every == len(pairs) else still / max(of_all, 1)
+    error = sum(look.error for look in looks) + share * max(left, 0.0)
+    return _Part(looks, error, every if every > len(pairs) else 1)
+
+
+def _renamed(verdict: Verdict, labels: Mapping[str, str], pairs: Sequence[tuple[str, str]]) -> Verdict | None:
+    """Return a verdict of another question in this one's names and order; None if it is about another pair."""
+    pair = labels.get(verdict.group, ""), labels.get(verdict.other, "")
+    if pair in pairs:
+        return replace(verdict, group=pair[0], other=pair[1])
+    if pair[::-1] not in pairs:
+        return None
+    said: Literal["better", "worse", "equivalent", "not decided"] = verdict.said
+    if verdict.said in ("better", "worse"):
+        said = "worse" if verdict.said == "better" else "better"
+    return replace(
+        verdict,
+        group=pair[1],
+        other=pair[0],
+        said=said,
+        difference=-verdict.difference,
+        low=-verdict.high,
+        high=-verdict.low,
+    )
