@@ -331,7 +331,7 @@ def test_the_page_lists_all_columns_with_their_units(recorded: Recorded, tmp_pat
         units = {name: unit for name, unit in listed[frame].items() if name not in ("value", "step")}
         assert units == {name: UNITS.get(name, "") for name in units}
     assert {name for name in listed["runs"] if "." not in name and "/" not in name} - {"seed"} == {
-        *("run", "title", "kind", "group", "state", "error", "started", "updated")
+        *("run", "title", "kind", "group", "state", "error", "started", "updated", "score")
     }
 
 
