@@ -161,6 +161,11 @@ def test_the_links_of_the_site_lead_somewhere_and_each_page_is_in_its_navigation
     assert sorted(re.findall(r": (\S+\.md)$", navigation, re.MULTILINE)) == sorted(pages)
 
 
+def test_the_site_searches_from_disk_by_a_script_of_its_own(site: Path) -> None:
+    (script,) = re.findall(r"polyfills: \[(\S*iframe-worker\S*)\]", (REPOSITORY / "mkdocs.yml").read_text())
+    assert "IFrameWorker" in (site / script).read_text()
+
+
 def test_the_site_has_every_verb_and_every_key(site: Path) -> None:
     listed = (site / "keys.md").read_text()
     assert [
