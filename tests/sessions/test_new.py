@@ -61,7 +61,7 @@ def test_what_is_written_keeps_every_contract(
         (["to=x"], "new: name one component"),
         (["model=mynet", "sampler=mine", "to=x"], "new: name one component"),
         (["model=MyNet", "to=x"], "model=MyNet: a name has lowercase letters"),
-        (["model=class", "to=x"], "model=class: is a word of Python's own"),
+        (["model=class", "to=x"], "model=class: is a keyword of Python"),
         (["model=cnn", "to=x"], "model=cnn: is built in and is not replaced"),
     ],
 )

@@ -351,7 +351,7 @@ def test_a_loss_that_is_no_number_stops_the_run_at_its_last_good_commit(small: S
     trainer.run(after(100))
     good = print_of(trainer, tmp_path)
     next(trainer.learner.network.parameters()).data[:] = np.nan
-    with pytest.raises(Diverged, match=f"update {trainer.learner.updates} is no finite number"):
+    with pytest.raises(Diverged, match=f"update {trainer.learner.updates} is not finite"):
         trainer.run()
     assert print_of(small(tmp_path, **quiet), tmp_path) == good
 
