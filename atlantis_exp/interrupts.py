@@ -1,4 +1,4 @@
-"""Ctrl-C from the first moment on, noted even where a library swallows the KeyboardInterrupt."""
+"""Note Ctrl-C from the start, even if a library swallows the KeyboardInterrupt."""
 
 import signal
 from types import FrameType
@@ -16,7 +16,6 @@ def listen() -> None:
 
 
 def seen() -> bool:
-    """Return whether a SIGINT has come, be it that its KeyboardInterrupt was swallowed."""
     return _seen
 
 

@@ -9,17 +9,17 @@ from atlantis_exp.runs.files import open_file
 from atlantis_exp.runs.journal import Artifact, Record, Tags, read, read_commit
 
 
-class Facts(NamedTuple):
+class JournalFacts(NamedTuple):
     """The last value of each tag, and the names of the files under `artifacts/`, as of the last commit."""
 
     tags: dict[str, str]
     artifacts: tuple[str, ...]  # each once, in order
 
 
-def read_facts(folder: Path) -> Facts:
+def read_facts(folder: Path) -> JournalFacts:
     """Read a run folder's tags and the names of its files. Raises: OSError, ValueError for a damaged journal."""
     paths = (record.path for record in _records(folder, "artifact") if isinstance(record, Artifact))
-    return Facts(read_tags(folder), tuple(dict.fromkeys(paths)))
+    return JournalFacts(read_tags(folder), tuple(dict.fromkeys(paths)))
 
 
 def read_tags(folder: Path) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Run folders: where a run lives, what its files are called, who holds it, and how it ended."""
+"""Run folders: their places, files, holders and results."""
 
 import json
 import os
@@ -145,7 +145,6 @@ class RunFolder:
 
     @property
     def title(self) -> str:
-        """The name that people read."""
         return commit.labels.get("mlflow.runName", self.name) if (commit := self.commit) else self.name
 
     @property
@@ -155,7 +154,6 @@ class RunFolder:
 
     @property
     def error(self) -> str:
-        """Why the run failed, empty if it did not."""
         return commit.error if (commit := self.commit) else ""
 
     @property

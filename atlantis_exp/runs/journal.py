@@ -18,8 +18,6 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal, get_args
 from uuid import uuid4
 
-from pydantic import ValidationError
-
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import (
     SMALL,
@@ -51,14 +49,14 @@ class Metrics:
 
 @dataclass(frozen=True)
 class Params:
-    """What the run was asked to do."""
+    """The settings of the run."""
 
     values: dict[str, str]
 
 
 @dataclass(frozen=True)
 class Tags:
-    """What is said about the run; a later value replaces an earlier one."""
+    """Facts about the run; a later value replaces an earlier one."""
 
     values: dict[str, str]
 
@@ -288,7 +286,7 @@ def read_commit(folder: Path) -> Commit | None:
     """Return a run folder's last commit, None before its first commit or status. Raises: JournalError."""
     path = folder / "commit.json"
     try:
-        return commit_of(read_file(path, SMALL)) if path.exists() else None
+        return schema_of(Commit).validate_json(read_file(path, SMALL), strict=True) if path.exists() else None
     except ValueError:
         raise JournalError(f"{path} is damaged: remove it and repeat the run's command") from None
 
@@ -298,14 +296,6 @@ def has_lost_commit(folder: Path) -> bool:
     commit, path = read_commit(folder), folder / "journal.jsonl"
     is_new = commit is None or (commit.status == "SCHEDULED" and not commit.offset)  # as a sweep makes it anew
     return is_new and path.exists() and path.stat().st_size > 0
-
-
-def commit_of(content: bytes) -> Commit:
-    """Return the commit in the bytes of a `commit.json`. Raises: JournalError."""
-    try:
-        return schema_of(Commit).validate_json(content, strict=True)
-    except ValidationError:
-        raise JournalError("this is not a commit.json") from None
 
 
 def commit_bytes(commit: Commit) -> bytes:
