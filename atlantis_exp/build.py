@@ -366,7 +366,7 @@ def build_trainer(
             memory=memory,
             tracker=tracker,
             progress=progress,
-            evaluate=partial(evaluator, watched),
+            play=partial(evaluator, watched),
             film=evaluator.film,
             score_range=game.score_range,
             about=about,

@@ -138,7 +138,7 @@ def _locate(fault: ErrorDetails, tree: Mapping[str, Any]) -> tuple[list[str], Ma
     node: Any = tree
     siblings: Mapping[str, Any] = tree
     for part in fault["loc"]:
-        # Pydantic puts the name of a union's member into the path; only what the tree really holds is a key.
+        # Pydantic puts the name of a union's member into the path, which is not a key of the tree.
         if isinstance(node, Mapping):
             siblings = node
             if part in node:

@@ -125,7 +125,7 @@ class Setting:
 
     name: str
     type: Any  # with its range
-    default: Any  # MISSING where there is none
+    default: Any  # MISSING: the setting is required
 
 
 @dataclass(frozen=True, eq=False)
@@ -477,7 +477,7 @@ def _package(reference: str, package: Distribution) -> tuple[Plugin, list[Callab
 
 def _read(reference: str, path: Path) -> bytes:
     if not path.is_file():
-        raise ConfigError(f"plugins={reference}: there is no file {path}")
+        raise ConfigError(f"plugins={reference}: {path} is not a file")
     try:
         return path.read_bytes()
     except OSError as error:

@@ -106,7 +106,6 @@ class EnvConfig:
 
     @property
     def title(self) -> str:
-        """The game's title."""
         return title_of(self.id)
 
 
@@ -162,7 +161,7 @@ class ObjectiveConfig(ComponentConfig):
     gamma: Annotated[float, Field(ge=0, lt=1)]
     n_step: Annotated[int, Field(ge=1, le=1_000)]  # rewards before the bootstrap
     reward_scale: Scale
-    reward_exponent: Annotated[float, Field(gt=0, le=1)] = 1.0  # of what is scaled
+    reward_exponent: Annotated[float, Field(gt=0, le=1)] = 1.0  # of the scaled reward
     reward_clip: Scale | None  # after both; null: not clipped
     terminal_on_life_loss: bool
     target: TargetConfig
@@ -206,32 +205,35 @@ Plugins = dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_][\w.-]{0,99}$")], Plu
 
 _MOST_SETTINGS = 100  # of a component that is not known here
 _Value = bool | Annotated[int, Field(ge=-(2**63), lt=2**63)] | float | str | None
-_Base = type[ComponentConfig]
+_BASES: dict[str, type[ComponentConfig]] = {"model": ModelConfig, "objective": ObjectiveConfig}
 
 
 @cache
-def _schema(base: _Base, component: Component) -> TypeAdapter[ComponentConfig]:
+def _schema(component: Component) -> TypeAdapter[ComponentConfig]:
     """Return the schema of a component whose class is known."""
     types = {each.name: each.type for each in component.settings}
     defaults = {each.name: each.default for each in component.settings if each.default is not MISSING}
-    return _extended(base, types, {**defaults, "component": component})
+    return _extended(component.kind, types, {**defaults, "component": component})
 
 
-def _unknown_schema(kind: str, base: _Base, names: Collection[str]) -> TypeAdapter[ComponentConfig]:
+def _unknown_schema(kind: str, names: Collection[str]) -> TypeAdapter[ComponentConfig]:
     """Return the schema of a component whose class is not known here: plain values, which can be compared."""
     if len(names) > _MOST_SETTINGS or any(iskeyword(name) or not re.fullmatch(NAME, name) for name in names):
         raise ConfigError(f"{kind}: has no settings of a component, or more than {_MOST_SETTINGS}")
-    return _extended(base, dict.fromkeys(names, _Value | list[_Value]), {})
+    return _extended(kind, dict.fromkeys(names, _Value | list[_Value]), {})
 
 
-def _extended(base: _Base, types: Mapping[str, Any], attributes: Mapping[str, Any]) -> TypeAdapter[ComponentConfig]:
+def _extended(kind: str, types: Mapping[str, Any], attributes: Mapping[str, Any]) -> TypeAdapter[ComponentConfig]:
     body = {**attributes, "own": tuple(types), "__annotations__": dict(types), "__module__": __name__}
-    schema: Any = dataclass(config=STRICT, kw_only=True, frozen=True)(type("Settings", (base,), body))
+    schema: Any = dataclass(config=STRICT, kw_only=True, frozen=True)(
+        type("Settings", (_BASES.get(kind, ComponentConfig),), body)
+    )
     return TypeAdapter(schema)
 
 
-def _component(kind: str, base: _Base = ComponentConfig) -> PlainValidator:
+def _component(kind: str) -> PlainValidator:
     """Return the validator of a component's config, which checks it by the settings of the component's class."""
+    base = _BASES.get(kind, ComponentConfig)
     common = {each.name for each in dataclasses.fields(base)}
 
     def read(tree: Any, info: ValidationInfo) -> ComponentConfig:
@@ -243,9 +245,9 @@ def _component(kind: str, base: _Base = ComponentConfig) -> PlainValidator:
             raise PydanticKnownError("union_tag_not_found", {"discriminator": "'name'"})
         component, plugins = known(kind).get(name), info.data.get("plugins") or {}
         if component is not None and (component.plugin is None or _is_recorded(component.plugin, plugins)):
-            schema = _schema(base, component)
+            schema = _schema(component)
         elif plugins and re.fullmatch(NAME, name):
-            schema = _unknown_schema(kind, base, tree.keys() - common)
+            schema = _unknown_schema(kind, tree.keys() - common)
         else:
             tags = ", ".join(f"'{each}'" for each in known(kind))
             raise PydanticKnownError(
@@ -393,8 +395,8 @@ class Config:
     training: TrainingConfig
     replay: ReplayConfig
     env: Env
-    model: Annotated[ModelConfig, _component("model", ModelConfig)]
-    objective: Annotated[ObjectiveConfig, _component("objective", ObjectiveConfig)]
+    model: Annotated[ModelConfig, _component("model")]
+    objective: Annotated[ObjectiveConfig, _component("objective")]
     optimizer: OptimizerConfig
     lr_schedule: Annotated[ComponentConfig, _component("lr_schedule")]
     epsilon: Annotated[ComponentConfig, _component("epsilon")]

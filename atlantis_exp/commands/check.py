@@ -18,11 +18,11 @@ _SMALL = (  # a training of seconds
     *("evaluation.every_steps=null", "tracking=none", "tracking.commit_episodes=2"),
 )
 _OURS = ("model=cnn", "model=resnet", "sampler=uniform", "objective=dqn")
-"""The components that others of their kinds are measured beside."""
+"""The components that others of their kinds are compared with."""
 
 
 def _work(asked: Asked[Config]) -> Callable[[], None]:
-    from atlantis_exp.sessions.contracts import check, trials
+    from atlantis_exp.sessions.contracts import check, contracts_of
 
     job = job_of(asked)
     chosen = [text for text in asked.overrides if text.partition("=")[0] in KINDS]
@@ -36,7 +36,7 @@ def _work(asked: Asked[Config]) -> Callable[[], None]:
             with suppress(ConfigError):  # other settings may not go with it
                 measured.setdefault(text, training_of([*own, text]))
     small = training_of(replaced([text for text in asked.overrides if not text.startswith("phase")], *_SMALL))
-    return partial(check, trials(job.config, small, kinds), measured)
+    return partial(check, contracts_of(job.config, small, kinds), measured)
 
 
 VERB = Verb("check", Config, _work)

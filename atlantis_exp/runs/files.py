@@ -49,7 +49,7 @@ def open_file(path: Path) -> BinaryIO:
         file = open(path, "rb", opener=no_link)  # noqa: SIM115
     except OSError as error:
         if error.errno == errno.ELOOP:
-            raise ValueError(f"{path} is a link, not a regular file") from None
+            raise ValueError(f"{path} is not a regular file, but a link") from None
         raise
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()

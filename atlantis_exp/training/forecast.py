@@ -34,7 +34,7 @@ class Forecast:
 
     @property
     def hours(self) -> float:
-        """Of training, evaluations not counted."""
+        """Hours of training, without evaluations."""
         return self.steps / self.steps_per_second / 3600
 
     def __str__(self) -> str:

@@ -61,7 +61,7 @@ class Plan:
 
     @property
     def length(self) -> int:
-        """Of all phases together, in the plan's unit."""
+        """The length of all phases, in the plan's unit."""
         return sum(phase.length for phase in self.phases)
 
     def done(self, counters: Counters) -> int:

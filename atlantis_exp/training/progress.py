@@ -91,7 +91,6 @@ class Progress:
         self._live: Live | None = None
 
     def say(self, text: str) -> None:
-        """Print a line."""
         self.console.print(text)
 
     def is_due(self) -> bool:
@@ -176,14 +175,11 @@ def _line(snapshot: Snapshot) -> str:
             f"score {snapshot.scores[-1]:,.0f}  mean of 20 {np.mean(snapshot.scores):,.0f}  "
             f"duration {snapshot.lengths[-1]:,} (mean of 100 {np.mean(snapshot.lengths):,.0f})"
         )
+    left = "?"
+    if snapshot.steps_left is not None and snapshot.steps_per_second > 0 and snapshot.updates:
+        left = terminal.clock(snapshot.steps_left / snapshot.steps_per_second)  # steps are faster without updates
     return (
         f"episode {snapshot.episode:,}  {shown}  epsilon {snapshot.epsilon:.2f}  "
         f"step {snapshot.steps:,}  updates {snapshot.updates:,}  {snapshot.steps_per_second:,.0f} steps/s  "
-        f"phase {snapshot.phase}  {snapshot.share:.1%}  left {_time_left(snapshot)}"
+        f"phase {snapshot.phase}  {snapshot.share:.1%}  left {left}"
     )
-
-
-def _time_left(snapshot: Snapshot) -> str:
-    if snapshot.steps_left is None or snapshot.steps_per_second <= 0 or not snapshot.updates:
-        return "?"  # without updates steps go many times as fast
-    return terminal.clock(snapshot.steps_left / snapshot.steps_per_second)

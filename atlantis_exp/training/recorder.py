@@ -24,7 +24,7 @@ from atlantis_exp.training.plan import Cadence, Counters, Plan
 from atlantis_exp.training.progress import Pace, Progress, Snapshot
 
 Stop = Callable[[], bool]
-Evaluate = Callable[[int, Progress, Stop], Evaluation]
+Play = Callable[[int, Progress, Stop], Evaluation]
 """Plays so many episodes. Raises: Stopped."""
 Film = Callable[[Evaluation, Progress, Stop], bytes | None]
 """Returns an mp4 of an evaluation's best episode, None if none is wanted. Raises: Stopped."""
@@ -59,30 +59,22 @@ class Diverged(Fault):
     """The loss was not finite; the last commit is from before."""
 
 
+@dataclass(kw_only=True, eq=False)
 class Recorder:
-    """Tells a tracker and a person how a training goes, without influence on it.
+    """Tells a tracker and a person how a training goes, without influence on it."""
 
-    score_range: the axis of the pictures of scores.
-    about: markdown at the end of the run's description.
-    """
+    plan: Plan
+    cadence: Cadence
+    learner: Learner
+    memory: ReplayMemory
+    tracker: Tracker
+    progress: Progress
+    play: Play
+    film: Film
+    score_range: tuple[float, float]  # the axis of the pictures of scores
+    about: str = ""  # markdown at the end of the run's description
 
-    def __init__(
-        self,
-        *,
-        plan: Plan,
-        cadence: Cadence,
-        learner: Learner,
-        memory: ReplayMemory,
-        tracker: Tracker,
-        progress: Progress,
-        evaluate: Evaluate,
-        film: Film,
-        score_range: tuple[float, float],
-        about: str = "",
-    ) -> None:
-        self.plan, self.cadence, self.learner, self.memory = plan, cadence, learner, memory
-        self.tracker, self.progress, self._evaluate, self._film = tracker, progress, evaluate, film
-        self.score_range, self.about = score_range, about
+    def __post_init__(self) -> None:
         self.episodes: list[Played] = []
         self.best_mean = -np.inf  # of all evaluations
         self.best_step = -1
@@ -185,9 +177,9 @@ class Recorder:
         self.evaluation_pending = True
         try:
             with self._pace.paused():
-                evaluation = self._evaluate(episodes, self.progress, stop)
+                evaluation = self.play(episodes, self.progress, stop)
                 is_best = evaluation.summary.mean > self.best_mean
-                video = self._film(evaluation, self.progress, stop) if is_best else None
+                video = self.film(evaluation, self.progress, stop) if is_best else None
         except Stopped:
             return
         self.evaluation_pending = False
@@ -217,7 +209,6 @@ class Recorder:
         self.progress.evaluated(step, counters.frames, evaluation)
 
     def recent_scores(self, count: int) -> list[float]:
-        """Return the scores of the last `count` episodes, the latest last."""
         return [played.score for played in self.episodes[-count:]]
 
     def state_dict(self) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -22,6 +22,7 @@ from atlantis_exp.training.recorder import Played, Recorder
 Outcome = Literal["finished", "budget", "interrupted"]
 
 
+@dataclass(kw_only=True, eq=False)
 class Trainer:
     """Trains one run, made of built parts, until the plan, the budget or a stop request ends it.
 
@@ -29,31 +30,23 @@ class Trainer:
     never depends on timing.
     """
 
-    def __init__(
-        self,
-        *,
-        plan: Plan,
-        emulators: Emulators,
-        stack: FrameStack,
-        actor: Actor,
-        memory: ReplayMemory,
-        learner: Learner,
-        exploration: Sequence[np.random.Generator],
-        sampling: np.random.Generator,
-        seeds: Sequence[int],
-        recorder: Recorder,
-        checkpoints: Checkpoints,
-        max_steps: int | None,
-    ) -> None:
-        self.plan = plan
-        self.emulators, self.stack, self.actor = emulators, stack, actor
-        self.memory, self.learner = memory, learner
-        self.exploration, self.sampling, self.seeds = exploration, sampling, seeds
-        self.recorder, self.checkpoints = recorder, checkpoints
-        self.max_steps = max_steps
+    plan: Plan
+    emulators: Emulators
+    stack: FrameStack
+    actor: Actor
+    memory: ReplayMemory
+    learner: Learner
+    exploration: Sequence[np.random.Generator]  # one an environment
+    sampling: np.random.Generator
+    seeds: Sequence[int]  # of the first episodes
+    recorder: Recorder
+    checkpoints: Checkpoints
+    max_steps: int | None
+
+    def __post_init__(self) -> None:
         self.counters = Counters()
-        self.scores = np.zeros(emulators.num_envs)  # of the episodes under way
-        self.lengths = np.zeros(emulators.num_envs, np.int64)  # of the episodes under way, steps
+        self.scores = np.zeros(self.emulators.num_envs)  # of the episodes under way
+        self.lengths = np.zeros(self.emulators.num_envs, np.int64)  # of the episodes under way, steps
         self._errors: list[tuple[Sampler, npt.NDArray[np.int64], torch.Tensor]] = []  # of updates since the feedback
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:

@@ -351,7 +351,7 @@ def test_a_death_at_any_file_operation_of_a_commit_leaves_the_commit_before_or_t
 
 def test_a_state_that_is_none_of_this_training_is_one_line_with_the_reason(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"\(KeyError: 'weights'\)"), unforged(tmp_path):
-        {}["weights"]
+        dict[str, int]()["weights"]
 
 
 @pytest.mark.parametrize(

@@ -421,7 +421,8 @@ def test_what_is_counted_is_what_a_naive_loop_counts(small: Small, tmp_path: Pat
     trainer.emulators.receive = received  # type: ignore[method-assign]
     assert trainer.run() == "finished"
     steps = frames = 0
-    scores, lengths, episodes = [0.0] * num_envs, [0] * num_envs, []
+    scores, lengths = [0.0] * num_envs, [0] * num_envs
+    episodes: list[Played] = []
     for each in shown:
         steps, frames = steps + num_envs, frames + sum(each.frames.tolist())
         for env in range(num_envs):
@@ -488,7 +489,7 @@ def test_the_description_counts_the_hours_of_the_last_evaluation_too(
     small: Small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trainer = small(tmp_path, evaluate_steps=None, evaluate_episodes=None, evaluate_at_end=True, max_steps=80)
-    played, late, clock = trainer.recorder._evaluate, 0.0, time.monotonic
+    played, late, clock = trainer.recorder.play, 0.0, time.monotonic
 
     def an_hour(*asked: Any) -> Evaluation:
         nonlocal late
@@ -496,7 +497,7 @@ def test_the_description_counts_the_hours_of_the_last_evaluation_too(
         return played(*asked)
 
     monkeypatch.setattr("time.monotonic", lambda: clock() + late)
-    monkeypatch.setattr(trainer.recorder, "_evaluate", an_hour)
+    trainer.recorder.play = an_hour
     assert trainer.run() == "budget"
     tags = [record.values for _, record in read(tmp_path) if isinstance(record, Tags)]
     assert " 1.00 hours" in [values[NOTE] for values in tags if NOTE in values][-1]
