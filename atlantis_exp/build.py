@@ -345,13 +345,14 @@ def build_trainer(
     config: cfg.Config, cores: int, folder: Path, tracker: Tracker, progress: Progress, about: str = ""
 ) -> Trainer:
     """Return a trainer that writes under `folder` only; `about` is part of the run's description, in markdown."""
-    env, game = config.env, facts_of(config.game)
+    env = config.env
     plan, learner, memory = build_plan(config), build_learner(config), build_memory(config)
     evaluator = build_evaluator(env, config.evaluation, cores)
+    cadence, game = build_cadence(config.evaluation, config.tracking), facts_of(config.game)
     watched = EpsilonGreedy(learner.evaluated_q_values, len(game.actions), watches=True)
     return Trainer(
         plan=plan,
-        emulators=build_emulators(env, cores, env.num_envs),
+        emulators=make_emulators(evaluator.make_emulator, env.num_envs, env.workers or cores),
         stack=FrameStack(env.num_envs, env.size, env.stack),
         actor=EpsilonGreedy(learner.q_values, len(game.actions)),
         memory=memory,
@@ -361,7 +362,7 @@ def build_trainer(
         seeds=stream(config.seed, "emulators").generate_state(env.num_envs).tolist(),
         recorder=Recorder(
             plan=plan,
-            cadence=build_cadence(config.evaluation, config.tracking),
+            cadence=cadence,
             learner=learner,
             memory=memory,
             tracker=tracker,
