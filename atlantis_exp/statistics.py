@@ -11,9 +11,8 @@ Scores = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Summary:
-    """Points of a score distribution, as the report prints them (figures 5.4, 5.5 and 5.9)."""
+    """Points of a score distribution (report figures 5.4, 5.5 and 5.9), in the order of an evaluation's metrics."""
 
-    episodes: int
     mean: float
     median: float
     high: float
@@ -22,6 +21,7 @@ class Summary:
     upper_quartile: float
     interquartile_mean: float
     standard_error: float  # of the mean; 0 for a single episode
+    episodes: int
 
 
 def summarize(scores: Sequence[float] | npt.NDArray[np.float64]) -> Summary:
