@@ -1,4 +1,4 @@
-"""The composition root: a checked config enters, a trainer or an evaluation made of built parts leaves."""
+"""Build trainers, players and evaluators from a checked config."""
 
 import dataclasses
 import zlib
@@ -45,12 +45,12 @@ OPTIMIZERS: dict[str, type[torch.optim.Optimizer]] = {
 
 
 def stream(seed: int, name: str) -> np.random.SeedSequence:
-    """The named random stream of a seed; streams of different names are independent."""
+    """Return the named random stream of a seed; streams of different names are independent."""
     return np.random.SeedSequence(seed, spawn_key=(zlib.crc32(name.encode()),))
 
 
 def build_game(component: Component) -> Game:
-    """What a game says of itself, with its code where it has parts of a score."""
+    """Return the facts of a game, with the code that splits its rewards if it has sources."""
     game = facts_of(component)
     if component.plugin is not None:
         check_game(game)
@@ -58,7 +58,7 @@ def build_game(component: Component) -> Game:
 
 
 def make_emulator(env: cfg.EnvConfig) -> partial[Emulator]:
-    """What makes one emulator, here or in a worker process. Raises: ConfigError."""
+    """Return a call that makes one emulator, here or in a worker process. Raises: ConfigError."""
     if (component := env.game) is None:
         raise ConfigError(f"env.id={env.id}: its game is a plugin's; name it with plugins=")
     return partial(
@@ -75,12 +75,12 @@ def make_emulator(env: cfg.EnvConfig) -> partial[Emulator]:
 
 
 def build_emulators(env: cfg.EnvConfig, cores: int, num_envs: int) -> Emulators:
-    """Return emulators: a single one in this process, several in worker processes, as many as cores unless set."""
+    """Return emulators, several in worker processes: one a core unless `env.workers` says otherwise."""
     return make_emulators(make_emulator(env), num_envs, env.workers or cores)
 
 
 def choose_device(name: str) -> torch.device:
-    """The device of that name; `auto` is the GPU where there is one. Raises: ConfigError."""
+    """Return the device of that name; `auto` is the GPU if there is one. Raises: ConfigError."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if name == "mps" and not torch.backends.mps.is_available():
@@ -92,11 +92,11 @@ def choose_device(name: str) -> torch.device:
 
 
 def choose_precision(name: str, device: torch.device) -> str:
-    """The precision of that name; `auto` is bf16 where the processor multiplies it faster than fp32."""
+    """Return the precision of that name; `auto` is bf16 if the device multiplies it faster than fp32."""
     if name != "auto":
         return name
     if device.type == "cuda":
-        # Before Ampere torch takes bf16, too, and computes it in float32 piece by piece.
+        # Before Ampere torch only emulates bf16.
         return "bf16" if torch.version.hip or torch.cuda.get_device_capability(device) >= (8, 0) else "fp32"
     has = torch.cpu.get_capabilities()
     # Intel's AVX-512 multiplies bf16 half as fast as fp32 (docs/performance.md), its AMX faster.
@@ -105,12 +105,10 @@ def choose_precision(name: str, device: torch.device) -> str:
 
 
 def build_component(config: cfg.Config, part: cfg.ComponentConfig, *given: object) -> Any:
-    """A part of a config as what its name stands for.
-
-    given: what its constructor takes besides settings.
+    """Return a component of a config, made of `given` arguments and its settings.
 
     Raises:
-        ConfigError: where it is a plugin's that no command line has named, or whose code fails.
+        ConfigError: its plugin is not named on the command line, or its code fails.
     """
     if (component := part.component) is None:
         raise ConfigError(needs(config))
@@ -120,16 +118,12 @@ def build_component(config: cfg.Config, part: cfg.ComponentConfig, *given: objec
 
 
 def described(config: cfg.Config) -> str:
-    """What people call the plugins of a config: `mynet 0.3, sha 1a2b3c4d5e6f`."""
+    """Return the plugins of a config in words: `mynet 0.3, sha 1a2b3c4d5e6f`."""
     return "; ".join(describe(name, each.version, each.sha256) for name, each in config.plugins.items())
 
 
 def import_components(config: cfg.Config) -> None:
-    """Import the classes that a config names.
-
-    Raises:
-        ConfigError: where one is a plugin's that no command line has named, or cannot be imported.
-    """
+    """Import the classes that a config names. Raises: ConfigError if a plugin is not named or cannot be imported."""
     parts: list[cfg.ComponentConfig] = [config.model, config.objective, config.epsilon, config.lr_schedule]
     for part in (*parts, *(config.sampler_of(phase) for phase in config.phase)):
         if part.component is None:
@@ -139,7 +133,7 @@ def import_components(config: cfg.Config) -> None:
 
 
 def _check_output(config: cfg.Config, network: nn.Module) -> None:
-    """Raise ConfigError where a plugin's network does not take states, or return what its head does."""
+    """Raise ConfigError if a plugin's network does not take states, or does not return the shape of its head."""
     component, env = config.model.component, config.env
     if component is None or component.plugin is None:
         return
@@ -155,14 +149,14 @@ def _check_output(config: cfg.Config, network: nn.Module) -> None:
 
 
 def _num_actions(config: cfg.Config) -> int:
-    """How many actions a config's game has. Raises: ConfigError where it is a plugin's that is not there."""
+    """Return the number of actions of a config's game. Raises: ConfigError if its plugin is not named."""
     if config.game is None:
         raise ConfigError(needs(config))
     return len(facts_of(config.game).actions)
 
 
 def needs(config: cfg.Config) -> str:
-    """The line that says which plugins a config needs, and what is wrong with those that there are."""
+    """Return the line that says which plugins a config needs and how the named ones differ."""
     there = {each.plugin.name: each.plugin for each in admitted().values() if each.plugin}
     wanted = {name: describe(name, each.version, each.sha256) for name, each in config.plugins.items()}
     lacking = {name: text for name, text in wanted.items() if str(there.get(name)) != text}
@@ -174,9 +168,9 @@ def needs(config: cfg.Config) -> str:
 
 
 def build_network(config: cfg.Config, name: str, device: torch.device | None = None) -> nn.Module:
-    """A network on a device with weights from the named stream; the global generator is as it was."""
+    """Return a network on a device with weights from the named stream; leave the global generator as it was."""
     if config.model.component is not None:
-        config.model.component.load()  # what a module draws when it is imported is no part of the weights
+        config.model.component.load()  # a module may draw when it is imported: before the weights are drawn
     initial, dropout = stream(config.seed, name).generate_state(2, np.uint64)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(initial >> np.uint64(1)))
@@ -188,7 +182,7 @@ def build_network(config: cfg.Config, name: str, device: torch.device | None = N
 
 
 def _architecture(config: cfg.Config) -> nn.Module:
-    """A network with weights from the global generator."""
+    """Return a network with weights from the global generator."""
     env, objective = config.env, config.objective
     head: Head = DuelingHead if config.model.head == "dueling" else nn.Linear
     if objective.component is None:
@@ -231,21 +225,20 @@ def build_learner(config: cfg.Config) -> Learner:
 
 
 def choose_shards(config: cfg.Config, device: torch.device) -> int:
-    """Return into how many parts a batch is cut: one a thread, on a processor where the network allows it."""
+    """Return the number of parts of a batch: one a thread, if the network allows it and lies on the CPU."""
     component = config.model.component
     is_split = device.type == "cpu" and component is not None and component.facts["splits_batches"]
     return (config.threads or OWN_THREADS) if is_split else 1
 
 
 def _compiled(network: nn.Module) -> nn.Module:
-    """A faster module of the same weights for batches of one size; on a GPU with CUDA graphs, which start all kernels
-    at once."""
+    """Return a faster module of the same weights for batches of one size; on a GPU with CUDA graphs."""
     on_gpu = next(network.parameters()).is_cuda
     return cast(nn.Module, torch.compile(network, dynamic=False, mode="reduce-overhead" if on_gpu else None))
 
 
 def build_plan(config: cfg.Config) -> Plan:
-    """Phases, schedules and learning cadence."""
+    """Return the phases, schedules and learning cadence."""
     objective = config.objective
     phases = []
     for name, phase in config.phase.items():
@@ -271,11 +264,7 @@ def build_plan(config: cfg.Config) -> Plan:
 
 
 def build_trained_network(config: cfg.Config, weights: bytes) -> nn.Module:
-    """The network that a training of this config has made, from its weights as safetensors.
-
-    Raises:
-        Fault: where the weights are damaged or another network's.
-    """
+    """Return a trained network from its weights as safetensors. Raises: Fault if they are damaged or do not fit."""
     try:
         tensors = safetensors.torch.load(weights)
         with torch.device("meta"):  # shapes first: a card may claim a network that no memory holds
@@ -292,7 +281,7 @@ def build_trained_network(config: cfg.Config, weights: bytes) -> nn.Module:
 
 
 def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Actor:
-    """The player that a training of this config has made, from its weights as safetensors. Raises: Fault."""
+    """Return the player of a trained network, from its weights as safetensors. Raises: Fault."""
     where = choose_device(device)
     network = build_trained_network(config, weights).to(where)
     precision = choose_precision(config.training.precision, where)
@@ -301,18 +290,18 @@ def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Acto
 
 
 def build_person(env: cfg.EnvConfig, choose: Callable[[npt.NDArray[np.uint8]], int]) -> tuple[PersonActor, Emulators]:
-    """A person at the keyboard, and the one emulator whose screen they see."""
+    """Return a person at the keyboard, and the one emulator whose screen they see."""
     emulator = make_emulator(env)()
     return PersonActor(emulator.screen_rgb, choose), make_emulators(lambda: emulator, 1, 1)
 
 
 def build_baseline(agent: cfg.BaselineAgentConfig, env: cfg.EnvConfig) -> Actor:
-    """A player of a game without a network."""
+    """Return a player without a network."""
     return RandomActor(len(facts_of(env.game).actions)) if agent.name == "random" else ConstantActor(agent.action)
 
 
 def build_evaluator(env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig, cores: int) -> Evaluator:
-    """Return what evaluates any actor by this protocol."""
+    """Return the evaluator of this protocol, for any actor."""
     make = make_emulator(env)
     workers = env.workers or max(1, cores - 1)  # one core is for the network, which decides meanwhile
     return Evaluator(
@@ -329,7 +318,7 @@ def build_evaluator(env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig, cores:
 
 
 def build_memory(config: cfg.Config) -> ReplayMemory:
-    """An empty replay memory. Raises: ConfigError where this machine cannot reserve it."""
+    """Return an empty replay memory. Raises: ConfigError if this machine cannot reserve it."""
     env, replay = config.env, config.replay
     try:
         return ReplayMemory(replay.capacity, (env.size, env.size), stack=env.stack, budget_bytes=replay.max_bytes)
@@ -338,7 +327,7 @@ def build_memory(config: cfg.Config) -> ReplayMemory:
 
 
 def build_cadence(evaluation: cfg.EvaluationConfig, tracking: cfg.TrackingConfig) -> Cadence:
-    """How often a training is written down."""
+    """Return how often a training is recorded, evaluated and committed."""
     return Cadence(
         curve_steps=tracking.every_steps,
         histogram_episodes=tracking.histogram_episodes,
@@ -355,14 +344,11 @@ def build_cadence(evaluation: cfg.EvaluationConfig, tracking: cfg.TrackingConfig
 def build_trainer(
     config: cfg.Config, cores: int, folder: Path, tracker: Tracker, progress: Progress, about: str = ""
 ) -> Trainer:
-    """Return all of a run; it writes under `folder` only. `about` opens its description, in markdown."""
+    """Return a trainer that writes under `folder` only; `about` is part of the run's description, in markdown."""
     env = config.env
     plan, learner, memory = build_plan(config), build_learner(config), build_memory(config)
-    evaluator, cadence = (
-        build_evaluator(env, config.evaluation, cores),
-        build_cadence(config.evaluation, config.tracking),
-    )
-    game = facts_of(config.game)
+    evaluator = build_evaluator(env, config.evaluation, cores)
+    cadence, game = build_cadence(config.evaluation, config.tracking), facts_of(config.game)
     watched = EpsilonGreedy(learner.evaluated_q_values, len(game.actions), watches=True)
     return Trainer(
         plan=plan,
@@ -381,7 +367,7 @@ def build_trainer(
             memory=memory,
             tracker=tracker,
             progress=progress,
-            evaluate=partial(evaluator, watched),
+            play=partial(evaluator, watched),
             film=evaluator.film,
             score_range=game.score_range,
             about=about,

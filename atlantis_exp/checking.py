@@ -20,7 +20,7 @@ _LONGEST = 10 * 365 * 24 * 3600  # seconds
 
 
 def nearest(word: str, choices: Iterable[str]) -> str:
-    """The end of an error line: the closest of `choices`, then all of them when they are few."""
+    """Return the end of an error line: the closest of `choices`, and all if there are at most 12."""
     choices = sorted(choices)
     close = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
     listed = f" (valid: {', '.join(choices)})" if len(choices) <= 12 else ""
@@ -28,7 +28,7 @@ def nearest(word: str, choices: Iterable[str]) -> str:
 
 
 def seconds(text: str | int) -> int:
-    """Return the seconds of a time such as 90, 90s, 10min, 3h or 1h30m, 0 where it is not readable."""
+    """Return the seconds of a time such as 90, 90s, 10min, 3h or 1h30m; 0 if it is not readable."""
     if re.fullmatch(r"\d+", str(text)):
         return int(text)
     parts = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m(?:in)?)?(?:(\d+)s)?", str(text))
@@ -37,7 +37,7 @@ def seconds(text: str | int) -> int:
 
 
 def check_time(key: str, text: str | int | None, example: str) -> None:
-    """Raise ConfigError where a key holds no time, or one beyond what a clock can wait for."""
+    """Raise ConfigError if a key does not hold a time of at most ten years."""
     if text is None:
         return
     if not (length := seconds(text)):
@@ -63,35 +63,30 @@ def absolute(key: str, text: str) -> Path:
         path = Path(text).expanduser().absolute()
         str(path).encode()
     except RuntimeError:
-        raise ConfigError(f"{key}={text}: there is no such user here, whose folder ~ would be") from None
+        raise ConfigError(f"{key}={text}: the user that ~ names does not exist here") from None
     except UnicodeEncodeError:
         raise ConfigError(f"{key}={text}: is in a folder whose name is not UTF-8; name another folder") from None
     return path
 
 
 def check_new(key: str, folder: Path) -> None:
-    """Raise ConfigError where a folder that is to be filled is there already and not empty."""
+    """Raise ConfigError if a folder to be filled exists and is not empty."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(f"{key}={folder}: is not empty; name another folder")
 
 
 def check_server(key: str, uri: str | None) -> None:
-    """Raise ConfigError where a key holds no server's address."""
-    # It is written into files, which is no place for a password.
+    """Raise ConfigError if a key does not hold a server's address, without a password: it is written to files."""
     if uri is not None and not re.fullmatch(r"https?://[^\s@?#]+", uri):
         raise ConfigError(
             f"{key}: should be null or a server's address, as in http://127.0.0.1:5000; user and password "
-            "belong into the environment, as MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD"
+            "belong in the environment, as MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD"
         )
 
 
 def parse(schema: type[T], tree: Mapping[str, Any]) -> T:
-    """Check a plain nested mapping against a schema class.
-
-    Raises:
-        ConfigError: one line for the first fault, with its dotted key and the nearest valid choice.
-    """
-    # Through JSON: its strict mode takes a list for a tuple, which is all that YAML can write.
+    """Check a plain nested mapping against a schema class. Raises: ConfigError, naming the first fault's key."""
+    # Through JSON, whose strict mode takes a list for a tuple: YAML has no tuples.
     text = json.dumps(tree)
     try:
         return TypeAdapter(schema).validate_json(text)
@@ -100,13 +95,13 @@ def parse(schema: type[T], tree: Mapping[str, Any]) -> T:
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """A config as plain JSON-able containers."""
+    """Return a config as containers that JSON can hold."""
     tree: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config)))
     return tree
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Dotted keys to leaves; lists are leaves."""
+    """Return dotted keys and their leaves; lists are leaves."""
     leaves: dict[str, Any] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping):
@@ -117,12 +112,12 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def digest(tree: Mapping[str, Any]) -> str:
-    """Ten hexadecimal digits of a mapping's canonical JSON."""
+    """Return ten hexadecimal digits of the hash of a mapping's canonical JSON."""
     return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:10]
 
 
 def _explain(faults: list[ErrorDetails], tree: Mapping[str, Any]) -> str:
-    """One line for the first fault of a tree, or for an unknown key if there is one."""
+    """Return one line for the first fault of a tree, or for an unknown key if there is one."""
     if isinstance(cause := faults[0].get("ctx", {}).get("error"), ConfigError):
         return str(cause)
     # A misspelt key shows twice, as one missing and one extra: the extra one is the user's.
@@ -149,12 +144,12 @@ def _explain(faults: list[ErrorDetails], tree: Mapping[str, Any]) -> str:
 
 
 def _locate(fault: ErrorDetails, tree: Mapping[str, Any]) -> tuple[list[str], Mapping[str, Any], Any]:
-    """A fault's key as the user knows it, the mapping that holds it, and its value."""
+    """Return a fault's key as the user knows it, the mapping that holds it, and its value."""
     path: list[str] = []
     node: Any = tree
     siblings: Mapping[str, Any] = tree
     for part in fault["loc"]:
-        # Pydantic puts the name of a union's member into the path; only what the tree really holds is a key.
+        # Pydantic puts the name of a union's member into the path, which is not a key of the tree.
         if isinstance(node, Mapping):
             siblings = node
             if part in node:

@@ -1,7 +1,7 @@
 """Components by kind and name: the classes that a config can name, ours and those of plugins.
 
-A plugin is imported when it is admitted. Only the command line admits one, nothing that is read from disk or from a
-server. A class of ours is imported when it is built: `built_in` has what a config is checked by before torch is there.
+A plugin is imported when the command line admits it; nothing read from disk or from a server can. A class of ours is
+imported when it is built: `built_in` declares its settings, so that a config is checked without torch.
 """
 
 import hashlib
@@ -34,7 +34,7 @@ C = TypeVar("C", bound=type)
 ENTRY_POINTS: Final = "atlantis_exp.plugins"
 """The group of the entry points by which an installed distribution names its modules with components."""
 NAME: Final = r"^[a-z][a-z0-9_]{0,39}$"
-"""The form of a component's name and a setting's: they become run folders and config keys."""
+"""The form of a component's or a setting's name: they become run folders and config keys."""
 
 # Ranges of settings.
 Count = Annotated[int, Interval(ge=1, le=10**12)]
@@ -105,11 +105,7 @@ class Plugin:
 
     @contextmanager
     def blamed(self, place: str) -> Iterator[None]:
-        """Turn an error of the plugin's code into one line with its file and line, `place` where none is known.
-
-        Raises:
-            ConfigError: in place of any error but a Fault.
-        """
+        """Turn any error but a Fault into a ConfigError with the file and line of the plugin, or else `place`."""
         try:
             yield
         except Fault:
@@ -129,7 +125,7 @@ class Setting:
 
     name: str
     type: Any  # with its range
-    default: Any  # MISSING where there is none
+    default: Any  # MISSING: the setting is required
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,11 +142,11 @@ class Component:
     plugin: Plugin | None = None  # None: it is ours
 
     def data_path(self, name: str) -> Path:
-        """Return the path of a file that comes with it: of `pong` and `scores.csv`, `pong_scores.csv` next to it."""
+        """Return the path of a file next to the source: for `pong` and `scores.csv`, `pong_scores.csv`."""
         return self.path.with_name(f"{self.name}_{name}")
 
     def blamed(self) -> AbstractContextManager[None]:
-        """Turn an error of a plugin's code into one line with its file and line. Raises: ConfigError."""
+        """Turn an error of a plugin's code into a ConfigError with its file and line."""
         return self.plugin.blamed(f"{self.path}:{self.line}") if self.plugin else nullcontext()
 
 
@@ -171,46 +167,44 @@ def component(name: str, *kinds: str) -> Callable[[C], C]:
 
 
 def describe(name: str, version: str | None, sha256: str) -> str:
-    """Return a plugin in words: `mynet 0.3, sha 1a2b3c4d5e6f`."""
+    """Return the name that people read: `mynet 0.3, sha 1a2b3c4d5e6f`."""
     return f"{name}{f' {version}' if version else ''}, sha {sha256[:12]}"
 
 
 @cache
 def built_in() -> Mapping[tuple[str, str], Component]:
     """Return our own components by kind and name."""
+    rescaled: dict[str, Any] = {"rescaling": Rescaling}
     quantiles: dict[str, Any] = {"quantiles": Quantiles, "head": "quantile"}
     ours = [
-        _ours("model", "cnn", "networks.cnn", "DQNCnn", smallest_side=36, splits_batches=True),
-        _ours("model", "cnn_small", "networks.cnn_small", "SmallCnn", smallest_side=20, splits_batches=True),
-        _ours("model", "resnet", "networks.resnet", "ResNetDQN", smallest_side=15),
-        _ours("model", "resnet_fast", "networks.resnet_fast", "ResNetFast", smallest_side=8, splits_batches=True),
-        _ours("sampler", "uniform", "replay.samplers", "UniformSampler"),
-        _ours("sampler", "top_half", "replay.samplers", "TopHalfSampler", oversample=Oversample),
-        _ours("sampler", "prioritized", "replay.samplers", "PrioritizedSampler", alpha=Probability, beta=Probability),
-        _ours("objective", "dqn", "learning.objectives", "DQN"),
-        _ours("objective", "double_dqn", "learning.objectives", "DoubleDQN"),
-        _ours("objective", "quantile", "learning.objectives", "Quantile", **quantiles),
-        _ours("objective", "double_quantile", "learning.objectives", "DoubleQuantile", **quantiles),
-        _ours("objective", "rescaled_double_dqn", "learning.objectives", "RescaledDoubleDQN", rescaling=Rescaling),
-        _ours(
-            *("objective", "rescaled_quantile", "learning.objectives", "RescaledQuantile"),
-            **quantiles,
-            rescaling=Rescaling,
-        ),
-        _ours("epsilon", "constant", "learning.schedules", "Constant"),
-        _ours("epsilon", "linear", "learning.schedules", "Linear"),
-        _ours("epsilon", "linear_steps", "learning.schedules", "LinearSteps"),
-        _ours("epsilon", "exponential", "learning.schedules", "Exponential"),
-        _ours("lr_schedule", "constant", "learning.schedules", "Constant"),
-        _ours("lr_schedule", "linear", "learning.schedules", "Linear"),
-        _ours("lr_schedule", "one_cycle", "learning.schedules", "OneCycle"),
-        _ours("env", "atlantis", "game.atlantis", "Atlantis"),
+        _ours("model", "cnn", "networks.cnn.DQNCnn", smallest_side=36, splits_batches=True),
+        _ours("model", "cnn_small", "networks.cnn_small.SmallCnn", smallest_side=20, splits_batches=True),
+        _ours("model", "resnet", "networks.resnet.ResNetDQN", smallest_side=15),
+        _ours("model", "resnet_fast", "networks.resnet_fast.ResNetFast", smallest_side=8, splits_batches=True),
+        _ours("sampler", "uniform", "replay.samplers.UniformSampler"),
+        _ours("sampler", "top_half", "replay.samplers.TopHalfSampler", oversample=Oversample),
+        _ours("sampler", "prioritized", "replay.samplers.PrioritizedSampler", alpha=Probability, beta=Probability),
+        _ours("objective", "dqn", "learning.objectives.DQN"),
+        _ours("objective", "double_dqn", "learning.objectives.DoubleDQN"),
+        _ours("objective", "quantile", "learning.objectives.Quantile", **quantiles),
+        _ours("objective", "double_quantile", "learning.objectives.DoubleQuantile", **quantiles),
+        _ours("objective", "rescaled_double_dqn", "learning.objectives.RescaledDoubleDQN", **rescaled),
+        _ours("objective", "rescaled_quantile", "learning.objectives.RescaledQuantile", **quantiles, **rescaled),
+        _ours("epsilon", "constant", "learning.schedules.Constant"),
+        _ours("epsilon", "linear", "learning.schedules.Linear"),
+        _ours("epsilon", "linear_steps", "learning.schedules.LinearSteps"),
+        _ours("epsilon", "exponential", "learning.schedules.Exponential"),
+        _ours("lr_schedule", "constant", "learning.schedules.Constant"),
+        _ours("lr_schedule", "linear", "learning.schedules.Linear"),
+        _ours("lr_schedule", "one_cycle", "learning.schedules.OneCycle"),
+        _ours("env", "atlantis", "game.atlantis.Atlantis"),
     ]
     return {(each.kind, each.name): each for each in ours}
 
 
-def _ours(kind: str, name: str, module: str, class_name: str, **declared: Any) -> Component:
-    """Return a component of ours with its declared settings and facts; a schedule or game is light and is read."""
+def _ours(kind: str, name: str, place: str, **declared: Any) -> Component:
+    """Return a component of ours with its declared settings and facts; those of a light class are read from it."""
+    module, _, class_name = place.rpartition(".")
 
     def load() -> type[Any]:
         loaded: type[Any] = getattr(import_module(f"atlantis_exp.{module}"), class_name)
@@ -226,7 +220,7 @@ def _ours(kind: str, name: str, module: str, class_name: str, **declared: Any) -
 
 
 def read(kind: str, cls: type[Any]) -> tuple[tuple[Setting, ...], dict[str, Any]]:
-    """Return the settings and facts of a class. Raises: TypeError where it breaks the contract of its kind."""
+    """Return the settings and facts of a class. Raises: TypeError if it breaks the contract of its kind."""
     named = [each for each in fields(KINDS[kind].facts) if each.name not in ("rom", "points")]
     facts = {each.name: getattr(cls, each.name, each.default) for each in named}
     return tuple(_settings(KINDS[kind].given, cls)), facts
@@ -257,7 +251,7 @@ def _settings(count: int, cls: type[Any]) -> Iterator[Setting]:
 
 
 def _check(kind: str, cls: type[Any], settings: Sequence[Setting], facts: Mapping[str, Any]) -> None:
-    """Raise TypeError where a plugin's class would fail later: defaults, facts, the signatures of its methods."""
+    """Raise TypeError if a plugin's class would fail later: its defaults, facts or methods' signatures."""
     for each in settings:
         if each.default is not MISSING:
             try:
@@ -294,7 +288,7 @@ def _check_game(cls: type[Any], settings: Sequence[Setting]) -> None:
     if not -math.inf < low < high < math.inf:
         raise TypeError(f"score_range: should be the lowest and the highest score, not ({low}, {high})")
     if getattr(cls, "sources", ()) and not hasattr(cls, "points"):
-        raise TypeError("sources: need a static method points(reward, ram) that returns what each has paid")
+        raise TypeError("sources: need a static method points(reward, ram) that returns the points of each")
 
 
 def _is_plain(told: Any) -> bool:
@@ -320,13 +314,13 @@ _admitted: Mapping[tuple[str, str], Component] = {}
 
 
 def admit(references: Sequence[str]) -> None:
-    """Import the plugins that a command line names; they and no others count in this process.
+    """Import the plugins that a command line names, in place of those admitted before.
 
-    references: files, as ./mynet.py, or names of installed distributions. A file is read once, however often it is
-    admitted in a row: a change during a sweep counts from the next command on.
+    references: files, as ./mynet.py, or names of installed distributions. The same ones again are not read again, so
+    that a sweep trains one version.
 
     Raises:
-        ConfigError: for a plugin that cannot be imported or breaks a contract, and for a name that is taken.
+        ConfigError: a plugin cannot be imported or breaks a contract, or a name is taken.
     """
     global _references, _admitted
     if (given := tuple(references)) == _references:
@@ -365,23 +359,23 @@ def known(kind: str) -> dict[str, Component]:
 
 
 def game_ids(name: str) -> tuple[str, str]:
-    """Return Gymnasium's two ids of a game: of `pong`, Pong-v0 and ALE/Pong-v5."""
+    """Return Gymnasium's two ids of a game: for `pong`, Pong-v0 and ALE/Pong-v5."""
     title = name.title().replace("_", "")
     return f"{title}-v0", f"ALE/{title}-v5"
 
 
 def game_of(env_id: str) -> Component | None:
-    """Return the game that one of Gymnasium's ids names, None where no admitted plugin has it."""
+    """Return the game that one of Gymnasium's ids names, None if it is unknown."""
     return next((game for name, game in known("env").items() if env_id in game_ids(name)), None)
 
 
 def title_of(env_id: str) -> str:
-    """Return the title of the game that one of Gymnasium's ids names: of ALE/Pong-v5, Pong."""
+    """Return the title of the game that one of Gymnasium's ids names: for ALE/Pong-v5, Pong."""
     return env_id.rpartition("/")[2].partition("-v")[0]
 
 
 def facts_of(game: Component | None) -> Game:
-    """Return the facts of a game without its code, no facts of an unknown one."""
+    """Return the facts of a game, without its code; the defaults for an unknown one."""
     return Game() if game is None else Game(rom=game.name, **game.facts)
 
 
@@ -418,7 +412,7 @@ def _load(path: Path, text: bytes) -> ModuleType:
 
 
 def installed() -> dict[str, list[str]]:
-    """Return the names of installed distributions' entry points, which are those of components; imports nothing."""
+    """Return the names of the components that each installed distribution offers; import nothing."""
     offered: dict[str, list[str]] = {}
     for point in entry_points(group=ENTRY_POINTS):
         if point.dist is not None:
@@ -432,7 +426,7 @@ def _components(plugin: Plugin, load: Callable[[], ModuleType]) -> Iterator[Comp
         module = load()
     top = module.__name__.partition(".")[0]
     for cls in vars(module).values():
-        # Not what it imports from elsewhere, and not what inherits from a component.
+        # Neither imported classes nor those that only inherit from a component.
         if isinstance(cls, type) and cls.__module__.partition(".")[0] == top and "__component__" in vars(cls):
             name, kinds, line = vars(cls)["__component__"]
             path = Path(str(sys.modules[cls.__module__].__file__))
@@ -444,7 +438,7 @@ def _components(plugin: Plugin, load: Callable[[], ModuleType]) -> Iterator[Comp
 
 
 def _plugin(reference: str) -> tuple[Plugin, list[Callable[[], ModuleType]]]:
-    """Return a plugin, not yet imported, and what imports its modules."""
+    """Return a plugin, not yet imported, and the functions that import its modules."""
     if "/" in reference or reference.endswith(".py"):
         path = absolute("plugins", reference)
         if not re.fullmatch(r"[A-Za-z_]\w{0,79}", path.stem, re.ASCII) or path.suffix != ".py":
@@ -462,7 +456,7 @@ def _plugin(reference: str) -> tuple[Plugin, list[Callable[[], ModuleType]]]:
 
 
 def _package(reference: str, package: Distribution) -> tuple[Plugin, list[Callable[[], ModuleType]]]:
-    """Return a distribution with the hash of the packages that its entry points name."""
+    """Return a distribution with the hash of the packages that its entry points name, and as `_plugin`."""
     modules = sorted({point.module for point in package.entry_points.select(group=ENTRY_POINTS)})
     if not modules:
         raise ConfigError(f"plugins={reference}: it has no entry point in the group {ENTRY_POINTS}")
@@ -483,7 +477,7 @@ def _package(reference: str, package: Distribution) -> tuple[Plugin, list[Callab
 
 def _read(reference: str, path: Path) -> bytes:
     if not path.is_file():
-        raise ConfigError(f"plugins={reference}: there is no file {path}")
+        raise ConfigError(f"plugins={reference}: {path} is not a file")
     try:
         return path.read_bytes()
     except OSError as error:

@@ -57,8 +57,7 @@ def _check_device(device: str) -> str:
 Device = Annotated[str, AfterValidator(_check_device)]
 
 FREE = frozenset(("plugins", "resume", "device", "threads", "compile", "tracking", "budget", "paths"))
-"""The keys that say how a run is done; of `plugins`, those that its components are of are part of what is trained."""
-
+"""Keys that say how a run is done, not what is trained; the plugins that a run uses do count."""
 
 _INDEX_BYTES = 23  # of the replay memory, an observation
 SCREEN = (210, 160)  # rows, columns of the emulator's screen
@@ -102,17 +101,16 @@ class EnvConfig:
 
     @property
     def game(self) -> Component | None:
-        """The game that the id names; None where it is a plugin's that no command line names."""
+        """The game that the id names; None if it belongs to a plugin that the command line does not name."""
         return game_of(self.id)
 
     @property
     def title(self) -> str:
-        """What people call the game."""
         return title_of(self.id)
 
 
 def _check_game(env: EnvConfig, info: ValidationInfo) -> EnvConfig:
-    """Raise ConfigError where the id names no game that is known here, nor may be one of a run's plugins."""
+    """Raise ConfigError for an unknown game, unless it may come from one of a run's plugins."""
     if env.game is None and not (info.data.get("plugins") and re.fullmatch(r"(ALE/)?[A-Z][A-Za-z0-9]*-v\d", env.id)):
         ids = [each for name in known("env") for each in game_ids(name)]
         raise ConfigError(f"env.id={env.id}: no such choice; {nearest(env.id, ids)}")
@@ -127,15 +125,14 @@ Env = Annotated[EnvConfig, AfterValidator(_check_game)]
 class ComponentConfig:
     """A component by name, and its settings: the fields that a subclass adds are its constructor's arguments."""
 
-    component: ClassVar[Component | None] = None  # None where it is a plugin's that no command line names
-    own: ClassVar[tuple[str, ...]] = ()
-    """The names of the settings."""
+    component: ClassVar[Component | None] = None  # None: of a plugin that the command line does not name
+    own: ClassVar[tuple[str, ...]] = ()  # names of the settings
 
     name: str
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the component's constructor takes."""
+        """The keyword arguments of the component's constructor."""
         return {name: getattr(self, name) for name in self.own}
 
 
@@ -164,7 +161,7 @@ class ObjectiveConfig(ComponentConfig):
     gamma: Annotated[float, Field(ge=0, lt=1)]
     n_step: Annotated[int, Field(ge=1, le=1_000)]  # rewards before the bootstrap
     reward_scale: Scale
-    reward_exponent: Annotated[float, Field(gt=0, le=1)] = 1.0  # of what is scaled
+    reward_exponent: Annotated[float, Field(gt=0, le=1)] = 1.0  # of the scaled reward
     reward_clip: Scale | None  # after both; null: not clipped
     terminal_on_life_loss: bool
     target: TargetConfig
@@ -196,18 +193,6 @@ class RmsPropConfig:
 OptimizerConfig = Annotated[AdamConfig | RmsPropConfig, Field(discriminator="name")]
 
 
-class SamplerConfig(ComponentConfig):
-    """What chooses a batch's transitions."""
-
-
-class EpsilonConfig(ComponentConfig):
-    """A schedule of epsilon."""
-
-
-class LrScheduleConfig(ComponentConfig):
-    """A schedule of the learning rate's factor."""
-
-
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class PluginConfig:
     """A plugin that a run was trained with, as it was then."""
@@ -220,42 +205,35 @@ Plugins = dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_][\w.-]{0,99}$")], Plu
 
 _MOST_SETTINGS = 100  # of a component that is not known here
 _Value = bool | Annotated[int, Field(ge=-(2**63), lt=2**63)] | float | str | None
+_BASES: dict[str, type[ComponentConfig]] = {"model": ModelConfig, "objective": ObjectiveConfig}
 
 
 @cache
-def _schema(kind: str, component: Component) -> TypeAdapter[ComponentConfig]:
-    """What checks the config of a component whose class is known."""
+def _schema(component: Component) -> TypeAdapter[ComponentConfig]:
+    """Return the schema of a component whose class is known."""
     types = {each.name: each.type for each in component.settings}
     defaults = {each.name: each.default for each in component.settings if each.default is not MISSING}
-    return _made(kind, types, {**defaults, "component": component})
+    return _extended(component.kind, types, {**defaults, "component": component})
 
 
 def _unknown_schema(kind: str, names: Collection[str]) -> TypeAdapter[ComponentConfig]:
-    """What checks the config of a component whose class nobody has named here: plain values, which can be compared."""
+    """Return the schema of a component whose class is not known here: plain values, which can be compared."""
     if len(names) > _MOST_SETTINGS or any(iskeyword(name) or not re.fullmatch(NAME, name) for name in names):
         raise ConfigError(f"{kind}: has no settings of a component, or more than {_MOST_SETTINGS}")
-    return _made(kind, dict.fromkeys(names, _Value | list[_Value]), {})
+    return _extended(kind, dict.fromkeys(names, _Value | list[_Value]), {})
 
 
-def _made(kind: str, types: Mapping[str, Any], attributes: Mapping[str, Any]) -> TypeAdapter[ComponentConfig]:
-    """A schema of a kind with further fields."""
+def _extended(kind: str, types: Mapping[str, Any], attributes: Mapping[str, Any]) -> TypeAdapter[ComponentConfig]:
     body = {**attributes, "own": tuple(types), "__annotations__": dict(types), "__module__": __name__}
-    schema: Any = dataclass(config=STRICT, kw_only=True, frozen=True)(type("Settings", (_BASES[kind],), body))
+    schema: Any = dataclass(config=STRICT, kw_only=True, frozen=True)(
+        type("Settings", (_BASES.get(kind, ComponentConfig),), body)
+    )
     return TypeAdapter(schema)
 
 
-_BASES: dict[str, type[ComponentConfig]] = {
-    "model": ModelConfig,
-    "sampler": SamplerConfig,
-    "objective": ObjectiveConfig,
-    "epsilon": EpsilonConfig,
-    "lr_schedule": LrScheduleConfig,
-}
-
-
 def _component(kind: str) -> PlainValidator:
-    """What reads the config of a component of a kind, by the schema that its class says it has."""
-    base = _BASES[kind]
+    """Return the validator of a component's config, which checks it by the settings of the component's class."""
+    base = _BASES.get(kind, ComponentConfig)
     common = {each.name for each in dataclasses.fields(base)}
 
     def read(tree: Any, info: ValidationInfo) -> ComponentConfig:
@@ -267,9 +245,9 @@ def _component(kind: str) -> PlainValidator:
             raise PydanticKnownError("union_tag_not_found", {"discriminator": "'name'"})
         component, plugins = known(kind).get(name), info.data.get("plugins") or {}
         if component is not None and (component.plugin is None or _is_recorded(component.plugin, plugins)):
-            schema = _schema(kind, component)
+            schema = _schema(component)
         elif plugins and re.fullmatch(NAME, name):
-            schema = _unknown_schema(kind, [*(tree.keys() - common)])
+            schema = _unknown_schema(kind, tree.keys() - common)
         else:
             tags = ", ".join(f"'{each}'" for each in known(kind))
             raise PydanticKnownError(
@@ -287,16 +265,14 @@ def _is_recorded(plugin: Plugin, plugins: Mapping[str, PluginConfig]) -> bool:
 
 
 def record_plugins(tree: dict[str, Any]) -> None:
-    """Write into a composed config which of the admitted plugins its components are of."""
+    """Write the admitted plugins whose components a composed config names into it."""
     samplers = tree["samplers"] if isinstance(tree.get("samplers"), dict) else {}
     named = [(kind, tree.get(kind)) for kind in KINDS] + [("sampler", each) for each in samplers.values()]
     found = [known(kind).get(str(part.get("name"))) for kind, part in named if isinstance(part, dict)]
     if isinstance(env := tree.get("env"), dict):
         found.append(game_of(str(env.get("id"))))
     plugins = {each.plugin.name: each.plugin for each in found if each is not None and each.plugin is not None}
-    tree["plugins"] = {
-        name: {"version": plugin.version, "sha256": plugin.sha256} for name, plugin in sorted(plugins.items())
-    }
+    tree["plugins"] = {name: {"version": each.version, "sha256": each.sha256} for name, each in sorted(plugins.items())}
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -310,7 +286,7 @@ class PhaseConfig:
 
 
 PINNED = r"^[^\x00-\x1f]{1,1000}@[0-9a-f]{16}$"
-"""A folder of weights and what its file of weights has for a SHA-256."""
+"""A folder of weights and the first digits of their SHA-256."""
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -321,18 +297,14 @@ class TrainingConfig:
     learn_start: Annotated[int, Field(ge=0, le=10**12)]  # transitions in the memory
     batch_size: Annotated[int, Field(ge=1, le=2**24)]  # transitions
     precision: Literal["auto", "fp32", "bf16"]
-    ema: Annotated[int, Field(ge=10, le=10**7)] | None = (
-        None  # updates over which evaluated weights are averaged; null: latest
-    )
+    ema: Annotated[int, Field(ge=10, le=10**7)] | None = None  # updates averaged for an evaluation; null: the latest
     weights: Annotated[str, Field(pattern=PINNED)] | None = None  # FOLDER@DIGEST of exported ones; null: random ones
 
     @property
     def pinned(self) -> tuple[str, str] | None:
-        """The folder of the weights to begin with, and sixteen hexadecimal digits of their SHA-256."""
-        if self.weights is None:
-            return None
-        folder, _, digits = self.weights.rpartition("@")
-        return folder, digits
+        """The folder of the initial weights, and the first digits of their SHA-256."""
+        folder, _, digits = (self.weights or "").rpartition("@")
+        return (folder, digits) if folder else None
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -359,7 +331,7 @@ class EvaluationConfig:
 
     @property
     def at_once(self) -> int:
-        """Episodes played side by side: more are faster, and rounds of one length leave no emulator idle."""
+        """Episodes played side by side: many, in rounds of one length that leave no emulator idle."""
         return self.num_envs or math.ceil(self.episodes / math.ceil(self.episodes / _MOST_GAMES))
 
 
@@ -381,7 +353,7 @@ class TrackingConfig:
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class BudgetConfig:
-    """Limits of this command that are no part of the experiment."""
+    """Limits of this command, which do not change the experiment."""
 
     steps: Count | None
     wall_clock: str | Count | None  # a number alone is in seconds
@@ -392,7 +364,6 @@ class BudgetConfig:
 
     @property
     def seconds(self) -> int | None:
-        """`wall_clock` in seconds."""
         return None if self.wall_clock is None else seconds(self.wall_clock)
 
 
@@ -427,10 +398,10 @@ class Config:
     model: Annotated[ModelConfig, _component("model")]
     objective: Annotated[ObjectiveConfig, _component("objective")]
     optimizer: OptimizerConfig
-    lr_schedule: Annotated[LrScheduleConfig, _component("lr_schedule")]
-    epsilon: Annotated[EpsilonConfig, _component("epsilon")]
-    samplers: dict[str, Annotated[SamplerConfig, _component("sampler")]]
-    sampler: Annotated[SamplerConfig, _component("sampler")]
+    lr_schedule: Annotated[ComponentConfig, _component("lr_schedule")]
+    epsilon: Annotated[ComponentConfig, _component("epsilon")]
+    samplers: dict[str, Annotated[ComponentConfig, _component("sampler")]]
+    sampler: Annotated[ComponentConfig, _component("sampler")]
     phase: dict[str, PhaseConfig]
     evaluation: EvaluationConfig
     tracking: TrackingConfig
@@ -445,9 +416,10 @@ class Config:
                 f"it is made for {self.model.input_size}"
             )
         if objective is not None and (objective.facts["head"] == "quantile") != (self.model.head == "quantile"):
+            names = [name for name, each in known("objective").items() if each.facts["head"] == "quantile"]
             raise ConfigError(
                 f"model.head={self.model.head}: does not go with objective.name={self.objective.name}; "
-                f"model.head=quantile and objective={' or '.join(_with_quantiles())} need each other"
+                f"model.head=quantile and objective={' or '.join(names)} need each other"
             )
         if self.training.batch_size > self.replay.capacity:
             raise ConfigError(
@@ -485,44 +457,40 @@ class Config:
 
     @property
     def game(self) -> Component | None:
-        """The game; None where it is a plugin's that no command line names, or that is not what it was."""
+        """The game; None if it belongs to a plugin that is not named, or has changed since."""
         game = self.env.game
         return game if game is None or game.plugin is None or _is_recorded(game.plugin, self.plugins) else None
 
-    def sampler_of(self, phase: str) -> SamplerConfig:
-        """The sampler that a phase names; the chosen one takes precedence over a library one of the same name."""
+    def sampler_of(self, phase: str) -> ComponentConfig:
+        """Return the sampler that a phase names; `sampler` takes precedence over one of `samplers` of the same name."""
         name = self.phase[phase].sampler
         return self.sampler if name == self.sampler.name else self.samplers[name]
 
     def science(self) -> dict[str, Any]:
-        """What decides the run's numbers: all but tracking, budget, places, devices and process counts."""
+        """Return the keys that decide the run's numbers: all but tracking, budget, places, devices, processes."""
         tree = to_dict(self)
         for key in (FREE - {"plugins"}) | {"samplers", "sampler"}:
             del tree[key]
         del tree["env"]["workers"]
-        tree["evaluation"]["video"] = bool(tree["evaluation"]["video"])  # what is filmed of a game is no part of it
+        tree["evaluation"]["video"] = bool(tree["evaluation"]["video"])  # whichever part is filmed
         if self.training.pinned is not None:
             _, tree["training"]["weights"] = self.training.pinned  # wherever they lie
-        for key in ("ema", "weights"):
-            if tree["training"][key] is None:  # a run from before there was the key stays itself
-                del tree["training"][key]
-        if tree["objective"]["reward_exponent"] == 1:
-            del tree["objective"]["reward_exponent"]
-        if not self.plugins:
-            del tree["plugins"]
+        # Keys at their defaults are left out: a run from before there was the key stays itself.
+        for part, key, default in (
+            *((tree["training"], "ema", None), (tree["training"], "weights", None)),
+            *((tree["objective"], "reward_exponent", 1), (tree, "plugins", {})),
+        ):
+            if part[key] == default:
+                del part[key]
         # A list, since the order of phases counts and their names do not.
         tree["phase"] = [{**phase, "sampler": to_dict(self.sampler_of(name))} for name, phase in tree["phase"].items()]
         return tree
 
     def identity(self) -> str:
-        """Ten hexadecimal digits that are equal exactly for runs with the same `science`."""
+        """Return ten hexadecimal digits that are equal exactly for runs with the same `science`."""
         return digest(self.science())
 
     def run_name(self) -> str:
-        """What differs, readably, and the identity, which alone decides."""
+        """Return a readable name that ends in the identity."""
         samplers = [phase.sampler for phase in self.phase.values()]
         return f"{self.model.name}-{'-'.join(dict.fromkeys(samplers))}-s{self.seed}-{self.identity()}"
-
-
-def _with_quantiles() -> list[str]:
-    return [name for name, each in known("objective").items() if each.facts["head"] == "quantile"]

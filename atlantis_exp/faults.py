@@ -1,4 +1,4 @@
-"""Mistakes and faults that end a command with one line, which a person can act on, instead of a traceback."""
+"""Errors that end a command with one line for a person instead of a traceback."""
 
 from errno import EACCES, EDQUOT, EFBIG, ENOSPC, EPERM, EROFS
 
@@ -23,7 +23,7 @@ class ConfigError(Fault, ValueError):
 
 
 def in_words(error: OSError) -> str:
-    """Return what a file or folder lacks, and what a person can do about it."""
+    """Return an error of a file or folder and its remedy."""
     place = f"{error.filename}: " if error.filename else ""
     remedy = ""
     if error.errno in (ENOSPC, EDQUOT, EFBIG):

@@ -7,10 +7,9 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Game:
-    """What is known of a game of ALE: a component of the kind `env` says it, as class attributes of these names.
+    """The facts of a game of ALE: class attributes of a component of the kind `env`.
 
-    Where it is silent, nothing is said of the game: no parts of a score, no published players, no human-normalised
-    scores.
+    Facts that are missing are left out of reports: parts of a score, published players, human-normalised scores.
     """
 
     rom: str = ""  # ALE's name of it, which is the component's
@@ -18,14 +17,14 @@ class Game:
     actions: tuple[str, ...] = ()  # ALE's minimal action set, in its order
     score_range: tuple[float, float] = (0.0, 0.0)  # the axis of histograms; logarithmic where it begins above 0
     episode_steps: int = 1_000  # of a random player, about
-    sources: tuple[str, ...] = ()  # what pays points
+    sources: tuple[str, ...] = ()  # of points
     sources_in_words: str = ""
     random_score: float = float("nan")  # of the published random player (Quan and Ostrovski, dqn_zoo/atari_data.py)
     human_score: float = float("nan")  # of the published human; the same table
-    published_in_words: str = ""  # what else to know of published scores
+    published_in_words: str = ""  # a remark on published scores
     held_score: float = float("nan")  # of any one action, held
     early_frames: int = 0  # of training, up to which published agents stay below the random player or near it
-    early_scores: str = ""  # in words, what they score then
+    early_scores: str = ""  # in words, their scores then
     keys: tuple[tuple[str, str], ...] = (  # pygame's name of a key to an action, in the order of precedence
         *(("left", "LEFT"), ("right", "RIGHT"), ("up", "UP"), ("down", "DOWN")),
         ("space", "FIRE"),

@@ -1,32 +1,28 @@
-"""What the environment of a process says of it: how many cores it has, and which launcher has started it."""
+"""Read the environment of a process: its cores and its launcher."""
 
 import os
 from dataclasses import dataclass
 
 JOB_OF = "ATLANTIS_EXP_JOB_OF"
-"""The environment variable by which a launcher's worker names the launcher to the process that trains its job."""
+"""The environment variable that names the launcher to the process of its job."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """The share of a machine that a process has, and what has started it."""
+    """A process's share of its machine, and its launcher."""
 
     cores: int
-    launcher: str | None = None  # whose worker has left one job of a sweep to this process
+    launcher: str | None = None  # of the sweep that this process does one job of
     slurm_restarts: int | None = None  # of this job; None outside of Slurm
 
 
 def all_cores() -> int:
-    """Return how many cores this process may run on."""
+    """Return the number of cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1  # macOS has none
 
 
 def here() -> Machine:
-    """Read this process's environment.
-
-    Its cores are its share of all in OMP_NUM_THREADS, where launchers and Slurm's scripts say it and where torch looks
-    for its threads.
-    """
+    """Read this process's environment; OMP_NUM_THREADS limits its cores, as launchers, Slurm and torch agree."""
     cores = all_cores()
     share, restarts = os.environ.get("OMP_NUM_THREADS", ""), os.environ.get("SLURM_RESTART_COUNT", "0")
     return Machine(

@@ -1,4 +1,4 @@
-"""Pictures and films of what happened, as bytes; heavy libraries are imported where they draw."""
+"""Draw pictures and films, as bytes; heavy libraries are imported on use."""
 
 import io
 import tempfile
@@ -23,12 +23,10 @@ PURPLE, SKY = "#CC79A7", "#56B4E9"
 
 
 def score_histogram(scores: Sequence[float], title: str, axis: tuple[float, float]) -> bytes:
-    """A PNG, 256 x 256, of a score distribution; scores beyond the axis stand at its ends.
+    """Return a PNG, 256 x 256, of a score distribution; scores beyond the axis stand at its ends.
 
-    axis: where it begins and ends, the same for all pictures of a game, so that runs and steps can be laid side by
-        side; logarithmic where it begins above 0.
-
-    The axis of the shares has the root for a scale: distributions over many bins and over one are both read on it.
+    axis: its two ends, the same for all pictures of a game; logarithmic if it begins above 0. Shares have a square root
+        scale, on which both broad and narrow distributions are legible.
     """
     figure, axes = _square()
     axes.hist(np.clip(scores, *axis), _edges(axis).tolist(), weights=np.full(len(scores), 1 / len(scores)), color=BLUE)
@@ -46,10 +44,9 @@ def score_histogram(scores: Sequence[float], title: str, axis: tuple[float, floa
 def score_heatmap(
     ends: Sequence[int], scores: Sequence[float], length: int, unit: str, axis: tuple[float, float]
 ) -> bytes:
-    """A PNG, 256 x 256, of how the score distribution moved: windows of the training by score, each column's darkest
-    bin its fullest.
+    """Return a PNG, 256 x 256, of the score distribution over the training, each column's fullest bin the darkest.
 
-    ends: where each episode ended, in the unit that the training's length has; scores: of the same episodes.
+    ends: of each episode, in the unit of the training's length; scores: of the same episodes.
     axis: as in `score_histogram`.
     """
     figure, axes = _square()
@@ -76,9 +73,9 @@ def scene(
     chosen: int | None,
     q_values: npt.NDArray[np.float32] | None,
 ) -> npt.NDArray[np.uint8]:
-    """A picture of a film: the (210, 160, 3) screen, doubled, and to its right who decides what, and why.
+    """Return a picture of a film: the (210, 160, 3) screen, doubled, and the decision to its right.
 
-    A bar is empty for the action of the least value and full for that of the highest; without values there is none.
+    An action's bar is empty for the least value and full for the highest; without values there are no bars.
     """
     import cv2
 
@@ -97,7 +94,7 @@ def scene(
     colour = _rgb(ORANGE if source == "random" else BLUE)
     cv2.rectangle(picture, (336, 116), (544, 148), colour, -1)
     write(f"decided by: {source}", 346, 137)
-    pitch = min(52, 228 // len(actions))  # of ALE's eighteen actions, too
+    pitch = min(52, 228 // len(actions))  # ALE has up to eighteen actions
     for index, action in enumerate(actions):
         y = 188 + pitch * index
         write(action, 336, y, (255, 255, 255) if index == chosen else (150, 150, 150))
@@ -113,11 +110,11 @@ def scene(
 
 
 def film(pictures: Iterable[npt.NDArray[np.uint8]], frames_per_second: float) -> bytes:
-    """An mp4 (h264, yuv420p) that browsers play, of (height, width, 3) uint8 pictures of even height and width."""
+    """Return an mp4 (h264, yuv420p) that browsers play, of (height, width, 3) uint8 pictures with even sides."""
     import av
     import cv2
 
-    # A file, since the second pass, which puts the index first so that a browser starts at once, opens it again.
+    # In a file: faststart opens it again to move the index to the front.
     with tempfile.NamedTemporaryFile(suffix=".mp4") as file:
         with av.open(file.name, "w", options={"movflags": "faststart"}) as container:
             rate = Fraction(frames_per_second).limit_denominator(1000)
@@ -127,7 +124,7 @@ def film(pictures: Iterable[npt.NDArray[np.uint8]], frames_per_second: float) ->
             for picture in pictures:
                 if not stream.codec_context.is_open:
                     stream.height, stream.width = picture.shape[:2]
-                # A tenth of what the encoder's own conversion takes.
+                # Ten times as fast as the encoder's own conversion.
                 yuv = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2YUV_I420), np.uint8)
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(yuv, format="yuv420p")))
             container.mux(stream.encode())
@@ -135,7 +132,7 @@ def film(pictures: Iterable[npt.NDArray[np.uint8]], frames_per_second: float) ->
 
 
 def run_colour(player: str, sampler: str | None = None) -> str:
-    """The colour of a run wherever it is drawn, as #rrggbb: the player's own, paler for other samplers than uniform."""
+    """Return a run's colour as #rrggbb: the player's own, paler for other samplers than uniform."""
     own = {"cnn": BLUE, "resnet": VERMILLION, "random": GREY, "constant": BLACK}
     rest = (GREEN, ORANGE, PURPLE, SKY)
     colour = _rgb(own.get(player) or rest[zlib.crc32(player.encode()) % len(rest)])

@@ -1,4 +1,4 @@
-"""What sets of episode scores say, and how surely."""
+"""Summaries, intervals and comparisons of episode scores."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,9 +11,8 @@ Scores = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Summary:
-    """Points of a score distribution, as the report prints them (figures 5.4, 5.5 and 5.9)."""
+    """Points of a score distribution (report figures 5.4, 5.5 and 5.9), in the order of an evaluation's metrics."""
 
-    episodes: int
     mean: float
     median: float
     high: float
@@ -22,17 +21,11 @@ class Summary:
     upper_quartile: float
     interquartile_mean: float
     standard_error: float  # of the mean; 0 for a single episode
+    episodes: int
 
 
 def summarize(scores: Sequence[float] | npt.NDArray[np.float64]) -> Summary:
-    """The summary of at least one score.
-
-    Quartiles are interpolated linearly; the interquartile mean drops floor(n / 4) scores at either end, as
-    `scipy.stats.trim_mean(scores, 0.25)` and rliable's IQM do.
-
-    Raises:
-        ValueError: without any score.
-    """
+    """Summarize at least one score; quartiles are interpolated linearly. Raises: ValueError without scores."""
     values = np.asarray(scores, dtype=np.float64)
     if values.size == 0:
         raise ValueError("a summary needs at least one score")
@@ -51,23 +44,21 @@ def summarize(scores: Sequence[float] | npt.NDArray[np.float64]) -> Summary:
 
 
 def human_normalised(score: float, random: float, human: float) -> float:
-    """0 for the random player's score, 1 for the human's (Mnih et al. 2015)."""
+    """Return a score on a scale of 0 for the random player and 1 for the human (Mnih et al. 2015)."""
     return (score - random) / (human - random)
 
 
 def interquartile_mean(scores: Scores) -> float:
-    """The mean without the lowest and the highest quarter, floor(n / 4) scores each: rliable's IQM."""
-    cut = len(scores) // 4  # as scipy's trim_mean to the last bit, but it costs a second to import
-    return float(
-        np.partition(np.asarray(scores, np.float64), (cut, len(scores) - cut - 1))[cut : len(scores) - cut].mean()
-    )
+    """Return the mean without the floor(n / 4) lowest and highest scores: rliable's IQM."""
+    low, high = len(scores) // 4, len(scores) - len(scores) // 4
+    # As scipy's trim_mean to the last bit, which costs a second to import.
+    return float(np.partition(np.asarray(scores, np.float64), (low, high - 1))[low:high].mean())
 
 
 def resample(seeds: Sequence[Scores], resamples: int, rng: np.random.Generator) -> Iterator[Scores]:
-    """Draw bootstrap samples of episodes that come by seeds: seeds with replacement, then each one's episodes.
+    """Draw bootstrap samples: seeds with replacement, then each one's episodes. Raises: ValueError without seeds.
 
-    Each pools the episodes of as many seeds as there are; only one at a time is in memory. Raises: ValueError without
-    a seed.
+    Each sample pools the episodes of its seeds; only one at a time is in memory.
     """
     if not seeds:
         raise ValueError("a bootstrap needs at least one seed")
@@ -84,14 +75,13 @@ def resample(seeds: Sequence[Scores], resamples: int, rng: np.random.Generator) 
 
 
 def interval(estimates: Sequence[float] | Sequence[Scores] | Scores) -> npt.NDArray[np.float64]:
-    """The middle 95 % of bootstrap estimates along their first axis, (2, ...): the percentile method."""
+    """Return the middle 95 % of bootstrap estimates along their first axis, (2, ...): the percentile method."""
     ends: npt.NDArray[np.float64] = np.percentile(np.asarray(estimates), (2.5, 97.5), axis=0)
     return ends
 
 
 def probability_of_improvement(scores: Scores, others: Scores) -> float:
-    """The probability that one of `scores` exceeds one of `others`, ties counted half: Mann and Whitney's U over all
-    pairs, as rliable has it (Agarwal et al. 2021)."""
+    """Return the probability that one of `scores` exceeds one of `others`; a tie counts half (Agarwal et al. 2021)."""
     ordered = np.sort(others)
     below = np.searchsorted(ordered, scores, "left") + np.searchsorted(ordered, scores, "right")
     return float(below.sum() / (2 * scores.size * others.size))

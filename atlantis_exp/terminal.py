@@ -1,4 +1,4 @@
-"""Texts on a terminal as they are, where a name with brackets is no markup; what is under way, and durations."""
+"""Print to a terminal: texts without markup or control characters, work in progress, durations."""
 
 import os
 import shutil
@@ -17,14 +17,14 @@ from rich.text import Text
 
 _HERE = Path(__file__).parent
 PROGRAM = "atlantis-exp" if (_HERE / "conf").is_dir() else "python -m atlantis_exp"
-"""What a person calls: an installed wheel, which brings the config groups, by the name of its command."""
-LINE_SECONDS = 4.0  # before the first line of what is under way: nothing begins with five seconds of silence
+"""The command to type: the script of an installed wheel, which has the config groups, or the module of a checkout."""
+LINE_SECONDS = 4.0  # before the first line about work in progress
 _documents: list[str] | None = None  # to be printed, while nothing else may be
-_FIRST_SECONDS = 1.0  # what takes less needs no line
+_FIRST_SECONDS = 1.0  # shorter work needs no line
 
 
 class _Harmless:
-    """A stream that leaves out what a terminal would obey, whatever is printed to it."""
+    """A stream that drops control characters."""
 
     def __init__(self, stream: TextIO) -> None:
         self.stream = stream
@@ -37,7 +37,7 @@ class _Harmless:
 
 
 class _Console(Console):
-    """A console that shows texts as they are, and sends codes of its own alone."""
+    """A console that shows texts as they are: only its own control codes reach the terminal."""
 
     def __init__(self, **settings: Any) -> None:
         file = sys.stdout.stream if isinstance(sys.stdout, _Harmless) else sys.stdout
@@ -48,7 +48,7 @@ class _Console(Console):
 
 
 def guard() -> None:
-    """Have stdout and stderr leave out what a terminal would obey, and write in any encoding."""
+    """Make stdout and stderr drop control characters, and write in any encoding."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if not isinstance(stream, _Harmless):
@@ -58,14 +58,14 @@ def guard() -> None:
 
 
 def console(least: int | None = None) -> Console:
-    """Return a console; least: columns of a table that would be cut on a narrower one, None to keep lines whole."""
+    """Return a console of at least `least` columns, for a table; None keeps lines whole."""
     if least is None:
         return _Console(soft_wrap=True)
     return _Console(width=max(shutil.get_terminal_size().columns, least))
 
 
 def harmless(text: str) -> str:
-    """Return a text without what a terminal would obey: its lines of printable characters."""
+    """Return a text without control characters but newlines."""
     return "".join(character for character in text if character == "\n" or character.isprintable())
 
 
@@ -99,15 +99,15 @@ def document(text: str) -> None:
 
 
 def until_line(lines: int) -> float:
-    """Return the seconds before the next line of what is under way, after so many: 4, 8, 16, then 30 each."""
+    """Return the seconds before the next line about work in progress: 4, 8, 16, then 30."""
     return min(LINE_SECONDS * 2.0 ** min(lines, 3), 30.0)
 
 
 @contextmanager
 def working(what: str, how_far: Callable[[], str] = str) -> Iterator[None]:
-    """Say what is under way, and how far: in a changing line on a terminal, elsewhere in a line every few seconds.
+    """Show work in progress: a changing line on a terminal, a line every few seconds elsewhere.
 
-    how_far is asked for each line, in another thread.
+    how_far: asked for each line, in another thread.
     """
     shown, began, ended = console(), time.monotonic(), threading.Event()
 
@@ -137,6 +137,6 @@ def working(what: str, how_far: Callable[[], str] = str) -> Iterator[None]:
 
 
 def clock(seconds: float) -> str:
-    """A duration as hours, minutes and seconds, 26:07:09; what is below zero is zero."""
+    """Return a duration as hours, minutes and seconds: 26:07:09; 0 for a negative one."""
     minutes, second = divmod(max(int(seconds), 0), 60)
     return f"{minutes // 60}:{minutes % 60:02}:{second:02}"

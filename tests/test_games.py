@@ -11,7 +11,7 @@ import pytest
 
 from atlantis_exp.build import build_game, make_emulator
 from atlantis_exp.checking import parse, to_dict
-from atlantis_exp.commands.composing import admit
+from atlantis_exp.commands.composing import admit_plugins
 from atlantis_exp.components import game_of, known, title_of
 from atlantis_exp.config import Config, EnvConfig
 from atlantis_exp.faults import ConfigError
@@ -34,13 +34,13 @@ BOTH = f"plugins=[{BREAKOUT},{PONG}]"
 @pytest.fixture(autouse=True)
 def _nothing_is_admitted_afterwards() -> Iterator[None]:
     yield
-    admit([])
+    admit_plugins([])
 
 
 @pytest.fixture
 def both() -> None:
     """Admits Breakout and Pong, as their command lines do."""
-    admit([BREAKOUT, PONG])
+    admit_plugins([BREAKOUT, PONG])
 
 
 @pytest.fixture
@@ -176,7 +176,7 @@ def test_a_run_of_another_game_is_one_by_its_id_and_its_plugin(tiny: Compose) ->
     assert {**to_dict(plain.env), "id": pong.env.id} == to_dict(pong.env)
     assert "plugins" not in tiny(BOTH).science()  # of Atlantis nothing is recorded
     stored = to_dict(pong)
-    admit([])
+    admit_plugins([])
     read = parse(Config, stored)
     assert (read.game, read.run_name()) == (None, pong.run_name())
     for id_ in ("../../evil", "ALE/Pong-v5\n", "", "os.system"):
@@ -193,7 +193,7 @@ def test_runs_of_two_games_are_not_compared(
     recorded: Recorded, said: Callable[..., str], command: Command, tmp_path: Path
 ) -> None:
     for game in ("breakout", "pong"):
-        admit([BREAKOUT, PONG])
+        admit_plugins([BREAKOUT, PONG])
         recorded(BOTH, f"env={game}")
     outputs = (f"paths.outputs={tmp_path}", "tracking=none")
     for by in ("model", "env", "env.id"):
@@ -210,7 +210,7 @@ def test_a_game_is_compared_by_its_own_facts_and_without_its_plugin_by_none(
     recorded: Recorded, command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for seed in range(2):
-        admit([BREAKOUT, PONG])
+        admit_plugins([BREAKOUT, PONG])
         recorded(BOTH, "env=breakout", f"seed={seed}", scores=(0.0, 3.0 + seed, 7.0))
     pages, tables = [], []
     for plugins in ((), (BOTH,)):
@@ -239,7 +239,7 @@ def test_frames_have_the_columns_of_the_games_that_are_read(recorded: Recorded, 
     recorded(BOTH, "env=breakout")
     assert "centre_vessel" not in load_runs(tmp_path).evaluations
     recorded(BOTH)
-    admit([BREAKOUT, PONG])
+    admit_plugins([BREAKOUT, PONG])
     recorded(BOTH, "env=pong")
     loaded = load_runs(tmp_path)
     assert {"centre_vessel", "wave_bonus", "won", "lost"} <= {*loaded.evaluations, *loaded.episodes}

@@ -480,7 +480,7 @@ def test_a_head_of_quantiles_needs_their_number(plugins: Path, said: Said) -> No
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        ("plugins=./none.py", "there is no file /.*/none.py"),
+        ("plugins=./none.py", "/.*/none.py is not a file"),
         ("plugins=./other/mynet.py,mynet.py", r"mynet\.py: /.*/other/mynet\.py is called mynet, too; rename one"),
         ("plugins=copy.py,mynet.py", r"/mynet.py:13: model=mynet is /.*/copy\.py's, too"),
         ("plugins=./my-net.py", r"write a file NAME\.py"),

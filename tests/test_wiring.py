@@ -273,7 +273,7 @@ def test_without_a_terminal_a_line_now_and_then_says_how_far_a_training_is(monke
         memory=unused,
         tracker=Tracker(),
         progress=Progress(Console(file=text, width=80, soft_wrap=True)),
-        evaluate=unused,
+        play=unused,
         film=unused,
         score_range=(0.0, 1.0),
     )

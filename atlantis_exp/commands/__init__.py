@@ -1,7 +1,7 @@
 """One module a verb: its schema, its overrides and one call.
 
-In: what a person typed. Out: checked values for the floors below. Hydra, OmegaConf and the command line live here and
-nowhere else; what a verb does lives in `sessions`.
+In: the words of a command line. Out: checked values for the floors below. Hydra, OmegaConf and the command line live
+here and nowhere else; the work of a verb lives in `sessions`.
 """
 
 import importlib
@@ -21,23 +21,23 @@ VERBS = {
     "export": "write a stored run's network as a folder to hand on: weights, card, scores: run=NAME to=pretrained/NAME",
     "baseline": "play without a network, as a tracked run: agent=random, agent=constant",
     "play": "play yourself at the keyboard, as a tracked run: player=NAME",
-    "query": "describe the environment, and what this config makes of it",
+    "query": "describe the environment, and its use by this config",
     "check": "try a component's contracts and measure its cost: model=mynet plugins=./mynet.py",
     "new": "write a package with a component of your own to begin with: model=mynet to=FOLDER",
     "verify-resume": "prove for any training that killing and continuing it changes no bit",
     "sync": "publish run folders to an MLflow store; to=URI to a server, every=30s until interrupted",
 }
-"""Each verb and what it does, as `--help` lists them: those of every day first."""
+"""The verbs and their purposes, as `--help` lists them: daily ones first."""
 DAILY = 6
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 CHECKOUT = _PACKAGE.parent
 CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else CHECKOUT / "conf"
-"""The config groups, those of a checkout or those that an installed package brings."""
+"""The config groups, of a checkout or of an installed package."""
 
 
 def default_outputs() -> Path:
-    """Return the outputs folder: a checkout's wherever one stands; an installed package has no place of its own."""
+    """Return the outputs folder: in the checkout, or in the working directory for an installed package."""
     return (CHECKOUT if CONF.parent == CHECKOUT else Path.cwd()) / "outputs"
 
 
@@ -50,12 +50,12 @@ def main() -> None:
     except (Exception, KeyboardInterrupt) as error:
         if isinstance(error, Exception) and not interrupts.seen():
             raise
-        print("atlantis_exp: interrupted", file=sys.stderr)  # before there is anything to lose, or a verb had said so
+        print("atlantis_exp: interrupted", file=sys.stderr)  # before a verb handles signals
         sys.exit(130)  # 128 + SIGINT
 
 
 def _split(words: list[str]) -> tuple[str, list[str]]:
-    """Return the verb of a command line and its arguments; ends the process where something is only to be printed."""
+    """Return the verb of a command line and its arguments; print help and the like, and end the process."""
     from atlantis_exp import terminal
 
     terminal.guard()

@@ -1,4 +1,4 @@
-"""A verb: its arguments checked before anything is written, then the one call that does the work."""
+"""A verb: check its arguments before anything is written, then make the one call that does the work."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 from atlantis_exp import interrupts, terminal
-from atlantis_exp.commands.composing import admit
+from atlantis_exp.commands.composing import admit_plugins
 from atlantis_exp.commands.overrides import check, flags_of, launcher, located, refuse_twice, shown
 from atlantis_exp.faults import ConfigError, Fault, in_words
 from atlantis_exp.machine import Machine, here
@@ -20,7 +20,7 @@ T_co = TypeVar("T_co", covariant=True)
 
 @dataclass(frozen=True)
 class Asked(Generic[T_co]):
-    """What a command line asks for, once: a checked config, and what was typed for it."""
+    """A checked config, and the words that were typed for it."""
 
     config: T_co
     verb: str
@@ -30,29 +30,28 @@ class Asked(Generic[T_co]):
 
     @property
     def command(self) -> str:
-        """What repeats it, as a shell takes it."""
+        """The command that repeats it."""
         return command_line(self.verb, *self.overrides)
 
 
 @dataclass(frozen=True)
 class Verb(Generic[T]):
-    """A verb: the config that it composes, the schema that checks it, and what does the work."""
+    """A verb: the config that it composes, the schema that checks it, and its work."""
 
     name: str
     schema: type[T]
     work: Callable[[Asked[T]], Callable[[], object]]
-    """Imports what does the work, and returns the call that does it; an int that this returns is a late signal."""
-    config_name: str = ""  # of the file under conf/; that of the verb unless it says otherwise
+    """Imports the session's module and returns the call that does the work, or returns the number of a late signal."""
+    config_name: str = ""  # of the file under conf/; by default the verb's name
     rewrite: Callable[[list[str]], list[str]] = list
-    """From arguments as people write them to Hydra's overrides. Raises: ConfigError."""
+    """Turns arguments as people write them into Hydra's overrides. Raises: ConfigError."""
     sweep: Callable[[Sequence[Asked[T]], Launcher, Sequence[str]], None] | None = None
     """Does the jobs of a sweep by a launcher, given the arguments; None: one after the other."""
 
     def run(self, arguments: list[str]) -> None:
         """Check the config that the arguments make, and do the work.
 
-        A user's mistake ends the process with exit code 2 and one line on stderr before the work starts; a `Fault` ends
-        it with its own exit code and one line, and so does a folder that cannot be written.
+        A `Fault` or an OSError ends the process with one line and its exit code, which is 2 for a user's mistake.
         """
         try:
             typed = located(arguments)
@@ -73,9 +72,7 @@ class Verb(Generic[T]):
                 elif self.sweep is not None:
                     self.sweep(asked, launcher(arguments), arguments)
                 elif not launcher(arguments).is_basic:
-                    raise ConfigError(
-                        f"hydra/launcher: runs trainings; {self.name} does one after the other, leave it out"
-                    )
+                    raise ConfigError(f"hydra/launcher: launches trainings, not {self.name}; leave it out")
                 else:
                     in_turn(self.work, asked)
         except Fault as error:
@@ -87,7 +84,7 @@ class Verb(Generic[T]):
 
     def asked(self, arguments: Sequence[str], typed: Sequence[str] = ()) -> list[Asked[T]]:
         """Check every job that arguments ask for. Raises: ConfigError."""
-        admit([])  # an earlier command of this process may have named plugins
+        admit_plugins([])  # drop the plugins of an earlier command of this process
         refuse_twice(arguments)
         own = flags_of(arguments).config_dir
         flags = (f"--config-dir={own}",) if own else ()
@@ -96,9 +93,9 @@ class Verb(Generic[T]):
 
 
 def in_turn(work: Callable[[Asked[T]], Callable[[], object]], asked: Sequence[Asked[T]]) -> None:
-    """Do the jobs of a sweep one after the other; if one fails the others are done, then the first error is raised.
+    """Do the jobs of a sweep one after the other, also after an error; raise the first error at the end.
 
-    A signal that came when a job had nothing left to stop ends the process after it.
+    A signal that came too late to stop a job ends the process after it.
     """
     first: Exception | None = None
     for each in asked:

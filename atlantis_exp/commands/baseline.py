@@ -39,19 +39,19 @@ class BaselineConfig:
             raise ConfigError(f"agent.action={self.agent.action}: {self.env.title} has no such action (valid: {named})")
 
     def identity(self) -> str:
-        """Ten hexadecimal digits that are equal exactly for baselines with the same numbers."""
+        """Return ten hexadecimal digits that are equal exactly for baselines with the same numbers."""
         env = to_dict(self.env)
         del env["workers"]
         plugins = {"plugins": {name: to_dict(each) for name, each in self.plugins.items()}} if self.plugins else {}
         return digest({**plugins, "agent": to_dict(self.agent), "env": env, "evaluation": to_dict(self.evaluation)})
 
     def run_name(self) -> str:
-        """The player, its action where it has one, and the identity."""
+        """Return a name of the player, its action, the game and the identity."""
         action = f"{self.agent.action}" if self.agent.name == "constant" else ""
         return f"{self.agent.name}{action}-{self.env.id.rsplit('/')[-1]}-{self.identity()}"
 
     def title(self) -> str:
-        """The player, its game, and a few digits of its identity."""
+        """Return the name that people read."""
         action = f" {self.agent.action}" if self.agent.name == "constant" else ""
         return f"{self.agent.name}{action} {self.env.id.rsplit('/')[-1]} {self.identity()[:6]}"
 

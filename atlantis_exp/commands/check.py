@@ -22,7 +22,7 @@ _SMALL = (  # a training of seconds
     *("evaluation.every_steps=null", "tracking=none", "tracking.commit_episodes=2"),
 )
 _OURS = ("model=cnn", "model=resnet", "sampler=uniform", "objective=dqn")
-"""The components that others of their kinds are measured beside."""
+"""The components that others of their kinds are compared with."""
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -33,7 +33,7 @@ class CheckConfig(Config):
 
 
 def _work(asked: Asked[Config]) -> Callable[[], None]:
-    from atlantis_exp.sessions.contracts import check, trials
+    from atlantis_exp.sessions.contracts import check, contracts_of
 
     overrides = tuple(text for text in asked.overrides if not text.startswith("format="))
     job = job_of(replace(asked, overrides=overrides))
@@ -48,7 +48,7 @@ def _work(asked: Asked[Config]) -> Callable[[], None]:
             with suppress(ConfigError):  # other settings may not go with it
                 measured.setdefault(text, training_of([*own, text]))
     small = training_of(replaced([text for text in overrides if not text.startswith("phase")], *_SMALL))
-    return partial(check, trials(job.config, small, kinds), measured)
+    return partial(check, contracts_of(job.config, small, kinds), measured)
 
 
 VERB = Verb("check", CheckConfig, _work)

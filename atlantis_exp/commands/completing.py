@@ -39,7 +39,7 @@ def complete(flag: str, words: Sequence[str]) -> str:
 
 
 def candidates(words: Sequence[str]) -> list[str]:
-    """Return what the last of a command line's words may become."""
+    """Return the completions of a command line's last word."""
     *before, word = words or [""]
     verb = before[0] if before and before[0] in VERBS else "train"
     key, equals, value = word.partition("=")

@@ -1,4 +1,4 @@
-"""The config groups composed into a checked config; by Hydra's compose API."""
+"""Compose the config groups into a checked config, by Hydra's compose API."""
 
 import hashlib
 import re
@@ -24,14 +24,14 @@ from atlantis_exp.runs.files import ARTIFACT, read_file
 T = TypeVar("T")
 
 _LIKE = {"model": "cnn", "objective": "dqn", "env": "atlantis_standard"}
-"""Of each kind whose components have keys besides their settings, ours with these alone; of games the protocol."""
+"""For each kind whose components have keys besides their settings, a component of ours without settings."""
 
 
 OmegaConf.register_new_resolver("outputs_folder", lambda: str(default_outputs()), replace=True)
 
 
 def _head_for(objective: str, other: str = "plain") -> str:
-    """The head that an objective needs, unless a person asks for another."""
+    """Return the head that an objective needs, or else `other`."""
     component = components.known("objective").get(objective)
     return other if component is None or component.facts["head"] == "plain" else str(component.facts["head"])
 
@@ -40,8 +40,8 @@ OmegaConf.register_new_resolver("head_for", _head_for, replace=True)
 
 
 def checked(schema: type[T], composed: DictConfig) -> T:
-    """A composed Hydra config as an instance of its schema class, its plugins admitted. Raises: ConfigError."""
-    admit(composed.get("plugins"))
+    """Return a composed config as an instance of its schema; admit its plugins. Raises: ConfigError."""
+    admit_plugins(composed.get("plugins"))
     composition = OmegaConf.to_container(composed, resolve=True)
     assert isinstance(composition, dict)
     tree = {str(key): value for key, value in composition.items() if key != "plugins"}
@@ -57,7 +57,7 @@ def checked(schema: type[T], composed: DictConfig) -> T:
 
 
 def _folder(key: str, text: str) -> Path:
-    """Return a path that is a folder or may become one. Raises: ConfigError."""
+    """Return the path of a folder, which may not exist yet. Raises: ConfigError."""
     folder = absolute(key, text)
     there = next(path for path in (folder, *folder.parents) if path.exists())
     if not there.is_dir() or folder == Path(folder.anchor):
@@ -67,25 +67,21 @@ def _folder(key: str, text: str) -> Path:
 
 
 def pinned(weights: str) -> str:
-    """A folder of exported weights as FOLDER@DIGEST, where a run's identity takes the digest from. Raises: ConfigError.
-
-    Who types a digest asks for no other weights.
-    """
+    """Return a folder of exported weights as FOLDER@DIGEST. Raises: ConfigError, also for another digest than typed."""
     folder, digits = weights.rpartition("@")[::2] if re.match(PINNED, weights) else (weights, "")
     path = Path(folder) / "weights.safetensors"
     try:
         found = hashlib.sha256(read_file(path.resolve(), ARTIFACT)).hexdigest()[:16]
     except (OSError, ValueError):
         others = [str(other.parent) for other in Path(folder).parent.glob("*/weights.safetensors")]
-        raise ConfigError(
-            f"training.weights={folder}: no folder of exported weights; {nearest(folder, others)}"
-        ) from None
+        hint = nearest(folder, others)
+        raise ConfigError(f"training.weights={folder}: not a folder of exported weights; {hint}") from None
     if digits not in ("", found):
         raise ConfigError(f"training.weights={weights}: the weights there are @{found}")
     return f"{folder}@{found}"
 
 
-def admit(plugins: Any) -> None:
+def admit_plugins(plugins: Any) -> None:
     """Admit the plugins that the key `plugins` holds, and make their components options. Raises: ConfigError."""
     references = [plugins] if isinstance(plugins, str) else plugins or []
     if isinstance(references, dict | DictConfig) or not all(isinstance(each, str) for each in references):
@@ -101,7 +97,7 @@ def admit(plugins: Any) -> None:
 
 
 def _option(component: components.Component) -> dict[str, Any]:
-    """What choosing a plugin's component puts into the config: its constructor's defaults and, over them, its YAML."""
+    """Return a plugin component's config: its constructor's defaults, then its YAML."""
     node: dict[str, Any] = {"defaults": [_LIKE[component.kind], "_self_"]} if component.kind in _LIKE else {}
     own = ("id", components.game_ids(component.name)[1]) if component.kind == "env" else ("name", component.name)
     node.update([own])

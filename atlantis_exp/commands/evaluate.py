@@ -27,10 +27,8 @@ class EvaluateConfig:
     def __post_init__(self) -> None:
         is_folder = "/" in self.weights or Path(self.weights, "card.json").exists()
         if self.weights not in ("latest", "best") and not is_folder:
-            raise ConfigError(
-                f"weights={self.weights}: neither a run's nor a folder, as in pretrained/NAME; "
-                f"{nearest(self.weights, ('latest', 'best'))}"
-            )
+            hint = nearest(self.weights, ("latest", "best"))
+            raise ConfigError(f"weights={self.weights}: neither a run's nor a folder, as in pretrained/NAME; {hint}")
 
 
 def spell_out(arguments: list[str]) -> list[str]:

@@ -10,20 +10,20 @@ from atlantis_exp.terminal import PROGRAM
 _GROUP = re.compile(r" +- (?P<preset>override /)?(?P<group>[\w@.]+): (?P<option>\w+)\s*(?:#.*)?")
 _KEY = re.compile(r"(?P<indent> *)(?P<key>\w+):(?P<value>.*?)\s*(?:#(?P<comment>.*))?")
 _SHOWN = re.compile(r"  ([\w.]+)(?:=|\s|$)")  # a key as a help shows it
-_DAILY = ("model", "sampler", "env", "objective", "phase")  # groups that a help shows first
+_DAILY = ("model", "sampler", "env", "objective", "phase")  # groups shown first
 _VALUES = 30  # columns of a key and its value, behind which its sentence begins
 
 _SWEEP = """\
   -m                 a sweep over the keys that have several values, as in seed=0,1,2
 """
 _FLAGS = """\
-  --cfg job          print the config instead; --resolve fills in what refers to other keys
+  --cfg job          print the config instead; --resolve fills in references to other keys
   --config-dir DIR   further options of groups, in files of your own
   --help             with GROUP=OPTION also the option's keys, with `all` every key"""
 
 
 def overview() -> str:
-    """Return the first screen: the verbs, those of every day first."""
+    """Return the first screen: the verbs, daily ones first."""
     lines = [f"  {name:15}{purpose}" for name, purpose in VERBS.items()]
     lines.insert(DAILY, "\nmore:")
     parts = [f"{PROGRAM} [VERB] KEY=VALUE ...", "\n".join(lines), *_plugins()]
@@ -33,7 +33,7 @@ def overview() -> str:
 
 
 def help_text(verb: str, arguments: Sequence[str]) -> str:
-    """Return what a verb does, its keys and groups, and the keys of the options that the arguments name."""
+    """Return a verb's purpose, its keys and groups, and the keys of the options that the arguments name."""
     named = dict(text.split("=", 1) for text in arguments if "=" in text)
     preset = CONF / "experiment" / f"{named.get('experiment')}.yaml"
     chosen = dict(_groups(preset)) | named if preset.is_file() else named
@@ -62,7 +62,7 @@ def key_names(verb: str, arguments: Sequence[str]) -> list[str]:
 
 
 def options_of(group: str) -> list[str]:
-    """Return the options of a group, none where it is not one."""
+    """Return the options of a group, none for any other key."""
     folder = group.partition("@")[0]
     return sorted(path.stem for path in (CONF / folder).glob("*.yaml")) if folder.isidentifier() else []
 
@@ -77,7 +77,7 @@ def _of_group(name: str, option: str) -> Iterator[str]:
 
 
 def _without(taken: Collection[str], lines: Iterable[str]) -> Iterator[str]:
-    """Yield the lines of a group but for keys that the verb's own file sets, with their sentences."""
+    """Yield the lines of a group without the keys, and their sentences, that the verb's own file sets."""
     is_taken = False
     for line in lines:
         if match := _SHOWN.match(line):
@@ -87,7 +87,7 @@ def _without(taken: Collection[str], lines: Iterable[str]) -> Iterator[str]:
 
 
 def _groups(path: Path) -> Iterator[tuple[str, str]]:
-    """Yield the groups of a file's defaults list with their options, those of the files that it names too."""
+    """Yield the groups and options in a file's defaults list and in the files that it names."""
     for line in _defaults(path):
         if match := _GROUP.fullmatch(line):
             yield match["group"], match["option"]
@@ -102,7 +102,7 @@ def _defaults(path: Path) -> list[str]:
 
 
 def _keys(path: Path, prefix: str) -> Iterator[str]:
-    """Yield a line for each key of a file: dotted key, value, sentence; those of the files that it is made of first."""
+    """Yield a line for each key of a file: dotted key, value, sentence; first those of its base files."""
     own = [*_own_keys(path, prefix)]
     names = {match[1] for line in own if (match := _SHOWN.match(line))}
     for line in _defaults(path):
@@ -112,7 +112,7 @@ def _keys(path: Path, prefix: str) -> Iterator[str]:
 
 
 def _own_keys(path: Path, prefix: str) -> Iterator[str]:
-    """Yield a line for each key that stands in a file itself, as `_keys`."""
+    """Yield a line for each key in a file itself, as `_keys`."""
     parents: list[str] = []
     in_defaults = False
     for line in path.read_text("utf-8").splitlines():
@@ -130,7 +130,7 @@ def _own_keys(path: Path, prefix: str) -> Iterator[str]:
 
 
 def _plugins() -> Iterator[str]:
-    """Yield a paragraph of the installed distributions with components, none of them imported."""
+    """Yield a paragraph of the installed distributions with components; import none."""
     from atlantis_exp.components import installed
 
     if lines := [f"  plugins={name}: {', '.join(names)}" for name, names in installed().items()]:

@@ -1,4 +1,4 @@
-"""From what was typed for a training to a `Job`: above all, what people will call the run."""
+"""Make a `Job` of a training's command line: above all, the run's title."""
 
 import json
 from collections.abc import Sequence
@@ -15,15 +15,15 @@ _SPELLED = 4  # values at most; beyond them a few digits of their hash tell runs
 
 
 def job_of(asked: Asked[Config]) -> Job:
-    """The training that was asked for."""
+    """Return the training that was asked for."""
     return Job(asked.config, words_of(asked.overrides), asked.overrides, asked.machine)
 
 
 def words_of(overrides: Sequence[str]) -> tuple[str, ...]:
-    """What a run's title says besides network, sampler and seed: chosen options, then changed values.
+    """Return a title's words besides network, sampler and seed: chosen options, then changed values.
 
-    Told from what was typed alone: `experiment=fast objective.n_step=3` makes `fast n_step=3`. A key is as short as it
-    is clear, and a value reads the same however it was written: Hydra writes 1_000 as 1000 for a job of a sweep.
+    `experiment=fast objective.n_step=3` gives `fast n_step=3`. Keys are as short as they are unique, and values are
+    normalised: Hydra writes 1_000 as 1000 for a job of a sweep.
     """
     options: dict[str, str] = {}
     values: dict[str, str] = {}
@@ -48,6 +48,6 @@ def words_of(overrides: Sequence[str]) -> tuple[str, ...]:
 
 
 def training_of(overrides: Sequence[str]) -> Job:
-    """The training that overrides make. Raises: ConfigError."""
+    """Return the training of some overrides. Raises: ConfigError."""
     ((texts, config),) = check("config", Config, overrides).items()
     return job_of(Asked(config, "train", texts))

@@ -1,4 +1,4 @@
-"""`python -m atlantis_exp new model=mynet to=FOLDER`: a package with a component of one's own, to begin with."""
+"""`python -m atlantis_exp new model=mynet to=FOLDER`: a package with a component to start from."""
 
 import keyword
 import re
@@ -34,7 +34,7 @@ class NewConfig:
                     f"{kind}={name}: a name has lowercase letters, digits and underscores, as in {kind}=mynet"
                 )
             if keyword.iskeyword(name):
-                raise ConfigError(f"{kind}={name}: is a word of Python's own; give yours another name")
+                raise ConfigError(f"{kind}={name}: is a keyword of Python; give yours another name")
             if (kind, name) in built_in():
                 raise ConfigError(f"{kind}={name}: is built in and is not replaced; give yours another name")
 

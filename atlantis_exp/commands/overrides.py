@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar, cast
 
 from hydra import compose
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -22,7 +22,7 @@ from yaml import YAMLError, safe_load
 
 from atlantis_exp.checking import absolute, flatten, nearest
 from atlantis_exp.commands import CONF
-from atlantis_exp.commands.composing import admit, checked, composing
+from atlantis_exp.commands.composing import admit_plugins, checked, composing
 from atlantis_exp.commands.helping import options_of
 from atlantis_exp.components import KINDS, admitted, installed
 from atlantis_exp.faults import ConfigError
@@ -58,7 +58,7 @@ def flags_of(arguments: Sequence[str]) -> argparse.Namespace:
     if flags.multirun and flags.cfg:
         raise ConfigError("--cfg job: shows one config; drop -m, and name one value a key")
     if flags.resolve and not flags.cfg:
-        raise ConfigError("--resolve: is about what is printed instead of the work; add --cfg job")
+        raise ConfigError("--resolve: changes how a config is printed; add --cfg job")
     flags.config_dir = flags.config_dir and absolute("--config-dir", flags.config_dir)
     flags.overrides = [text.lstrip("+") for text in flags.overrides]  # every key is there already
     return flags
@@ -71,36 +71,30 @@ def read_flags(arguments: Sequence[str]) -> tuple[list[str], bool]:
 
 
 def located(arguments: Sequence[str]) -> list[str]:
-    """Return arguments that mean the same in any folder: flags first, `--config-dir` and plugins as absolute paths.
-
-    In the place of `sweep=FILE` come the file's overrides.
+    """Return arguments that mean the same in any folder: flags first, paths absolute, `sweep=FILE` filled in.
 
     Raises:
-        ConfigError: for an unknown flag, and for such a file that cannot be read.
+        ConfigError: a flag is unknown or the file cannot be read.
     """
     flags = flags_of(arguments)
-    texts = itertools.chain.from_iterable(
-        _from_file(text[6:]) if text.startswith("sweep=") else [text] for text in flags.overrides
-    )
+    parts = (_from_file(text[6:]) if text.startswith("sweep=") else [text] for text in flags.overrides)
     return [
         *([f"--config-dir={flags.config_dir}"] if flags.config_dir else []),
         *(["-m"] if flags.multirun else []),
         *(["--cfg", flags.cfg] if flags.cfg else []),
         *(["--resolve"] if flags.resolve else []),
-        *(re.sub(r"^plugins=(.+)$", _located, text, flags=re.DOTALL) for text in texts),
+        *(re.sub(r"^plugins=(.+)$", _located, text, flags=re.DOTALL) for text in itertools.chain(*parts)),
     ]
 
 
 def _from_file(name: str) -> Iterator[str]:
-    """Yield the overrides in a YAML file: of each key a value, a list of values, or Hydra's words for them."""
+    """Yield the overrides in a YAML file: for each key a value, a list of values, or Hydra's words for them."""
     try:
         tree = safe_load(read_file(absolute("sweep", name), SMALL))
         leaves = flatten(tree)
     except (OSError, ValueError, AttributeError, RecursionError, YAMLError) as error:
         reason = " ".join(str(error).split())
-        raise ConfigError(
-            f"sweep={name}: should be a file with KEY: VALUE or KEY: [VALUES] a line ({reason})"
-        ) from None
+        raise ConfigError(f"sweep={name}: write KEY: VALUE or KEY: [VALUES] on each line ({reason})") from None
     for key, value in leaves.items():
         values = value if isinstance(value, list) else [value]
         yield f"{key}={','.join(each if isinstance(each, str) else json.dumps(each) for each in values)}"
@@ -118,7 +112,7 @@ def _located(match: re.Match[str]) -> str:
 
 
 def refuse_twice(arguments: Sequence[str]) -> None:
-    """Refuse a key with two values, of which Hydra would take the last. Raises: ConfigError."""
+    """Raise ConfigError for a key with two values: Hydra would take the last."""
     given: dict[str, str] = {}
     for text in read_flags(arguments)[0]:
         if (before := given.setdefault(key_of(text), text)) != text:
@@ -126,7 +120,7 @@ def refuse_twice(arguments: Sequence[str]) -> None:
 
 
 def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[tuple[str, ...], T]:
-    """Compose and check every job that a command line asks for: their configs by their overrides; writes nothing.
+    """Compose and check every job of a command line; return their configs by their overrides.
 
     Raises:
         ConfigError: one line for the first mistake, with the nearest valid choice or the valid range.
@@ -140,7 +134,7 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
             raise ConfigError(f"{override.input_line}: needed; write {_key(override)}=VALUE")
     launcher(arguments)
     overrides = [override for override in overrides if not _is_hydras(override)]
-    admit(next((override.value() for override in overrides if override.key_or_group == "plugins"), []))
+    admit_plugins(next((override.value() for override in overrides if override.key_or_group == "plugins"), []))
     own: Path | None = flags.config_dir
     if own is not None:
         _check_config_dir(own)
@@ -153,15 +147,8 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
     except (HydraException, OmegaConfBaseException) as error:
         reason = f": {error.__cause__}" if isinstance(error.__cause__, OmegaConfBaseException) else ""
         raise ConfigError(" ".join(re.split("Config search path|full_key:", f"{error}{reason}")[0].split())) from None
-    except ConfigError:
-        raise
-    except (
-        YAMLError,
-        ValueError,
-        TypeError,
-        RecursionError,
-    ) as error:  # of a file that Hydra and OmegaConf trusted
-        if own is None:
+    except (YAMLError, ValueError, TypeError, RecursionError) as error:  # Hydra and OmegaConf trust their files
+        if own is None or isinstance(error, ConfigError):
             raise
         reason = " ".join(str(error).split())
         raise ConfigError(f"--config-dir={own}: {type(error).__name__}: {reason}") from None
@@ -171,9 +158,8 @@ def shown(config_name: str, arguments: Sequence[str]) -> str:
     """Return the composed config of a checked command line as YAML."""
     flags = flags_of(arguments)
     with composing():
-        return OmegaConf.to_yaml(
-            _composed(config_name, tuple(flags.overrides), flags.config_dir), resolve=flags.resolve
-        )
+        composed = _composed(config_name, tuple(flags.overrides), flags.config_dir)
+        return OmegaConf.to_yaml(composed, resolve=flags.resolve)
 
 
 def swept(arguments: Sequence[str]) -> list[str]:
@@ -182,13 +168,10 @@ def swept(arguments: Sequence[str]) -> list[str]:
 
 
 def launcher(arguments: Sequence[str]) -> Launcher:
-    """Return the launcher of a sweep that a command line asks for.
-
-    `hydra/launcher=NAME` chooses it and `hydra.launcher.KEY=VALUE` sets it up. Nothing else of Hydra's passes, as it
-    names code or places.
+    """Return the launcher that a command line names by `hydra/launcher=NAME` and `hydra.launcher.KEY=VALUE`.
 
     Raises:
-        ConfigError: for that, for a launcher that there is none of or that lacks something, for a wrong setting.
+        ConfigError: the launcher or a setting is unknown, or it is Hydra's other key, which could name code.
     """
     texts, is_sweep = read_flags(arguments)
     overrides = [override for text in texts if _is_hydras(override := read_override(text))]
@@ -199,9 +182,9 @@ def launcher(arguments: Sequence[str]) -> Launcher:
         if key == "hydra.mode":
             raise ConfigError(f"{text}: write -m for a sweep")
         if override.is_delete() or not (is_choice or key.startswith("hydra.launcher.")):
-            raise ConfigError(f"{text}: of Hydra's own, hydra/launcher=NAME and hydra.launcher.KEY=VALUE pass")
+            raise ConfigError(f"{text}: use only hydra/launcher=NAME and hydra.launcher.KEY=VALUE of Hydra's keys")
         if not is_sweep:
-            raise ConfigError(f"{text}: is about the jobs of a sweep; add -m, or leave it out")
+            raise ConfigError(f"{text}: applies to a sweep; add -m, or leave it out")
         if is_choice:
             name = str(override.value())
     names = ["basic", *(path.stem for path in _LAUNCHERS.glob("*.yaml"))]
@@ -210,7 +193,7 @@ def launcher(arguments: Sequence[str]) -> Launcher:
     if name == "slurm" and find_spec("submitit") is None:
         raise ConfigError("hydra/launcher=slurm: needs pip install 'atlantis-exp[slurm]'")
     if name == "slurm" and shutil.which("srun") is None:
-        raise ConfigError("hydra/launcher=slurm: there is no srun here; submit from a machine of the cluster")
+        raise ConfigError("hydra/launcher=slurm: srun is missing here; submit from a machine of the cluster")
     settings = DictConfig({}) if name == "basic" else OmegaConf.load(_LAUNCHERS / f"{name}.yaml")
     assert isinstance(settings, DictConfig)
     for override in overrides:
@@ -219,12 +202,12 @@ def launcher(arguments: Sequence[str]) -> Launcher:
     if name == "basic":
         return BASIC
     if settings.get("n_jobs") == 0:
-        raise ConfigError("hydra.launcher.n_jobs=0: should be how many jobs at a time, or -1 for one a core")
+        raise ConfigError("hydra.launcher.n_jobs=0: write the number of jobs at a time, or -1 for one a core")
     return Launcher(name, OmegaConf.to_container(settings))  # type: ignore[arg-type]
 
 
 def _set_up(settings: DictConfig, override: Override) -> None:
-    """Change one setting of a launcher; what is below it, its user names."""
+    """Change one setting of a launcher; keys below it are free."""
     key, value = override.key_or_group.removeprefix("hydra.launcher."), override.value()
     first, _, below = key.partition(".")
     if first not in settings:
@@ -238,12 +221,12 @@ def _set_up(settings: DictConfig, override: Override) -> None:
 
 
 def read_override(text: str) -> Override:
-    """An override as Hydra understands it. Raises: ConfigError."""
+    """Parse an override as Hydra does. Raises: ConfigError."""
     if "=" not in text and not text.startswith("~"):
-        raise ConfigError(f"'{text}' is no override; write KEY=VALUE, as in model=resnet")
+        raise ConfigError(f"'{text}' is not an override; write KEY=VALUE, as in model=resnet")
     try:
         return OverridesParser.create().parse_override(text)
-    except ValueError:  # Python's own
+    except ValueError:  # Python's
         raise ConfigError(f"{text[:60]}...: a number of more than 4,300 digits") from None
     except RecursionError:
         raise ConfigError(f"{text[:60]}...: lists within lists, too deep to be read") from None
@@ -254,8 +237,7 @@ def read_override(text: str) -> Override:
 
 
 def key_of(text: str) -> str:
-    """What an override is about, as `sampler@samplers.uniform` of `++sampler@samplers.uniform=top_half`, however it is
-    written. Raises: ConfigError."""
+    """Return the key of an override, without its prefix: `sampler@samplers.uniform`. Raises: ConfigError."""
     return _key(read_override(text))
 
 
@@ -264,26 +246,24 @@ def _is_hydras(override: Override) -> bool:
 
 
 def _jobs(overrides: list[Override]) -> Iterator[list[str]]:
-    """The overrides of each job of a sweep (of the one job without a sweep)."""
+    """Return the overrides of each job."""
     choices = []
     for override in overrides:
-        if override.is_sweep_override():
-            key = str(override.input_line).split("=", 1)[0]
-            choices.append([f"{key}={value}" for value in values_of(override)])
-        else:
-            choices.append([str(override.input_line)])
-    yield from map(list, combined(choices))
+        key = str(override.input_line).split("=", 1)[0]
+        is_sweep = override.is_sweep_override()
+        choices.append([f"{key}={each}" for each in values_of(override)] if is_sweep else [str(override.input_line)])
+    return map(list, combined(choices))
 
 
 def combined(choices: Sequence[Sequence[str]]) -> Iterator[tuple[str, ...]]:
-    """One of each with each of the others, the last one first to change. Raises: ConfigError for too many."""
+    """Return the product of choices. Raises: ConfigError for too many."""
     if (count := math.prod(map(len, choices))) > _MOST_JOBS:
         raise ConfigError(f"these values make {count:,} jobs, more than {_MOST_JOBS:,}: name fewer")
     return itertools.product(*choices)
 
 
 def values_of(override: Override) -> list[str]:
-    """The values that an override lists. Raises: ConfigError where there are none, or more than a sweep has jobs."""
+    """Return the values that an override lists. Raises: ConfigError for none or too many."""
     if isinstance(listed := override.value(), RangeSweep) and is_longer(listed, _MOST_JOBS):
         raise ConfigError(f"{override.input_line}: more than {_MOST_JOBS:,} values")
     try:
@@ -294,33 +274,28 @@ def values_of(override: Override) -> list[str]:
     except HydraException:
         text = override.input_line
         if isinstance(listed, Glob) and (names := listed.filter(options_of(override.key_or_group))):
-            raise ConfigError(
-                f"{text}: write the options out, as in {override.key_or_group}={','.join(names)}"
-            ) from None
-        raise ConfigError(f"{text}: no list of values; write them out, or let `search` draw them") from None
+            raise ConfigError(f"{text}: list the options, as in {override.key_or_group}={','.join(names)}") from None
+        raise ConfigError(f"{text}: not a list of values; write them out, or let `search` draw them") from None
     if not values:
-        raise ConfigError(f"{override.input_line}: there is no value in it")
+        raise ConfigError(f"{override.input_line}: has no values")
     return values
 
 
 def with_first_values(arguments: Sequence[str]) -> list[str]:
-    """Return arguments with the first of the values that a key is given, which others may need to be valid.
-
-    Raises:
-        ConfigError: where there are none.
-    """
+    """Return arguments with only the first value of each key. Raises: ConfigError for a key without values."""
     several = swept(arguments)
     return [_first_value(text) if text.lstrip("+") in several else text for text in arguments]
 
 
 def _first_value(text: str) -> str:
-    value = read_override(text).value()
-    first = value.start if isinstance(value, IntervalSweep) else values_of(read_override(text))[0]
+    override = read_override(text)
+    value = override.value()
+    first = value.start if isinstance(value, IntervalSweep) else values_of(override)[0]
     return f"{text.split('=', 1)[0]}={first}"
 
 
 def is_longer(values: RangeSweep, most: int) -> bool:
-    """Whether a range has more numbers; not where its step is 0, of which Python has a word to say."""
+    """Tell whether a range has more numbers than `most`; False for step 0, which fails later."""
     assert values.start is not None
     assert values.stop is not None
     return values.step != 0 and abs(values.stop - values.start) > most * abs(values.step)
@@ -331,10 +306,8 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
     groups = _groups(config_name)
     chosen = tuple(text for text, override in overrides.items() if _key(override) in groups)
     for text in chosen:
-        override = overrides[text]
-        folder, value = override.key_or_group, override.value()
-        places = (CONF, own) if own is not None else (CONF,)
-        options = {path.stem for place in places for path in (place / folder).glob("*.yaml")}
+        folder, value = overrides[text].key_or_group, overrides[text].value()
+        options = {path.stem for place in filter(None, (CONF, own)) for path in (place / folder).glob("*.yaml")}
         options |= {component.name for component in admitted().values() if component.kind == folder}
         if not isinstance(value, str) or value not in options:
             hint = "; one of your own needs plugins=./FILE.py" if folder in KINDS and not admitted() else ""
@@ -346,7 +319,7 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
     try:
         try:
             composed = _composed(config_name, tuple(texts), own)
-        except (HydraException, ValueError):  # mostly no such key; to know all takes as long as to compose
+        except (HydraException, ValueError):  # most often an unknown key, which `_check_keys` explains better
             _check_keys(values, _keys(config_name, chosen, own), groups)
             raise
         if OmegaConf.select(composed, "plugins") and "plugins" not in {_key(each) for each in overrides.values()}:
@@ -354,13 +327,12 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
         return checked(schema, composed)
     except InterpolationKeyError as error:
         missing = "".join(re.findall("'(.*)'", str(error)))
-        raise ConfigError(
-            f"${{{missing}}}: no such key; {_nearest_key(missing, _keys(config_name, chosen, own))}"
-        ) from None
+        hint = _nearest_key(missing, _keys(config_name, chosen, own))
+        raise ConfigError(f"${{{missing}}}: no such key; {hint}") from None
 
 
 def _check_keys(values: Mapping[str, Override], keys: frozenset[str], groups: set[str]) -> None:
-    """Refuse overrides of keys that are not there."""
+    """Raise ConfigError for an override of an unknown key."""
     branches = {key.rsplit(".", depth)[0] for key in keys for depth in range(1, key.count(".") + 1)}
     for text, override in values.items():
         key = _key(override)
@@ -369,7 +341,7 @@ def _check_keys(values: Mapping[str, Override], keys: frozenset[str], groups: se
 
 
 def _check_config_dir(folder: Path) -> None:
-    """Refuse a folder that is none, or that would be heard on more than the options of groups. Raises: ConfigError."""
+    """Raise ConfigError for a folder that is missing, or would change more than add options to groups."""
     if not folder.is_dir():
         raise ConfigError(f"--config-dir={folder}: no such folder")
     if (folder / "hydra").exists():
@@ -381,31 +353,28 @@ def _check_config_dir(folder: Path) -> None:
 
 
 def _offered(folder: str, name: str) -> str:
-    """What to write for an option that an installed distribution offers; empty where none does."""
+    """Return the advice for an option that an installed distribution offers, or an empty text."""
     offers = [f"plugins={plugin}" for plugin, names in installed().items() if folder in KINDS and name in names]
     return f"{folder}={name}: add {' or '.join(offers)}" if offers else ""
 
 
 @cache
 def _composed(config_name: str, texts: tuple[str, ...], own: Path | None) -> DictConfig:
-    """Compose a config; `own` is a folder with further options, which come behind ours."""
+    """Compose a config; `own` is a folder of further options, searched after ours."""
     return compose(config_name, [*texts, *([f"hydra.searchpath=[{quoted(f'file://{own}')}]"] if own else [])])
 
 
 @cache
 def _keys(config_name: str, chosen: tuple[str, ...], own: Path | None) -> frozenset[str]:
-    """The keys that options of groups give, which many jobs of a sweep share."""
-    tree = OmegaConf.to_container(_composed(config_name, chosen, own))
-    assert isinstance(tree, dict)
-    return frozenset(flatten({str(key): value for key, value in tree.items()}))
+    """Return the keys that the chosen options of groups give, which many jobs of a sweep share."""
+    tree: Any = OmegaConf.to_container(_composed(config_name, chosen, own))
+    return frozenset(flatten(tree))
 
 
 def _groups(config_name: str) -> set[str]:
-    """The groups of a verb's defaults list, with the package that they fill: `model`, `sampler@samplers.uniform`."""
-    config = OmegaConf.load(CONF / f"{config_name}.yaml")
-    assert isinstance(config, DictConfig)
+    """Return the groups of a verb's defaults list, with the package that they fill: `sampler@samplers.uniform`."""
     groups: set[str] = set()
-    for entry in config.get("defaults", ()):
+    for entry in cast(DictConfig, OmegaConf.load(CONF / f"{config_name}.yaml")).get("defaults", ()):
         if isinstance(entry, DictConfig):
             groups |= {str(group) for group in entry}
         elif entry != "_self_":
@@ -418,8 +387,7 @@ def _key(override: Override) -> str:
 
 
 def _nearest_key(key: str, keys: frozenset[str]) -> str:
-    """The nearest key of the same parent, or of any depth; a bare name is compared with last parts, too, as `lr` with
-    `optimizer.lr`."""
+    """Suggest the nearest key of the same parent, or else of any; `lr` matches `optimizer.lr`."""
     parent = key.rpartition(".")[0]
     siblings = {known for known in keys if parent and known.rpartition(".")[0] == parent}
     exact = sorted(known for known in keys if known.rsplit(".", 1)[-1] == key.rsplit(".", 1)[-1])

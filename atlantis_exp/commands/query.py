@@ -1,4 +1,4 @@
-"""`python -m atlantis_exp query`: what the environment is (report figures 1.1 to 1.3)."""
+"""`python -m atlantis_exp query`: describe the environment (report figures 1.1 to 1.3)."""
 
 from collections.abc import Callable
 from functools import partial

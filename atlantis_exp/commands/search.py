@@ -25,22 +25,22 @@ _FIRST_SEED = 1_000  # behind all that `decide` trains
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class PruningConfig:
-    """When a trial is cut short: below the median of the others' at the same evaluation."""
+    """When a trial below the median of the others at the same evaluation is cut short."""
 
-    trials: Count | None  # that have ended before any is cut short; null: none ever is
+    trials: Count | None  # that end before any is cut short; null: none is
     evaluations: Annotated[int, Field(ge=0)]  # a trial's first ones, at which it is never cut short
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class SearchConfig(Config):
-    """A search for the best values of some keys of a training's config, which is the rest of this one."""
+    """A training's config, and the search for the best values of some of its keys."""
 
     trials: Count
     seeds: Count  # trainings a trial
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,59}$")] | None
     startup: Annotated[int, Field(ge=0)]  # trials drawn at random
     pruning: PruningConfig
-    space: dict[str, str]  # what is searched of a key, in Hydra's words: `tag(log, interval(1e-5, 1e-3))`
+    space: dict[str, str]  # the values of each key, in Hydra's words: `tag(log, interval(1e-5, 1e-3))`
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -58,7 +58,7 @@ CLOSED = _OWN | FREE | {"seed", "evaluation"}
 def _first_trial(arguments: list[str]) -> list[str]:
     """Take the first of the values that a key is to be searched among."""
     if {"-m", "--multirun"} & set(arguments):
-        raise ConfigError("-m: a search is not a sweep, it tries one set of values after the other; drop -m")
+        raise ConfigError("-m: a search is not a sweep; drop -m")
     refuse_twice([argument.removeprefix("space.") for argument in arguments])
     return with_first_values(arguments)
 
@@ -72,7 +72,7 @@ def _work(asked: Asked[SearchConfig]) -> Callable[[], None]:
 
 
 def search_of(asked: Asked[SearchConfig]) -> "Search":
-    """Return the search that was asked for. Raises: ConfigError where a value of the space makes no valid config."""
+    """Return the search that was asked for. Raises: ConfigError if a value of the space is not valid."""
     from atlantis_exp.commands.space import check_space, read_space
     from atlantis_exp.sessions.search import Search
 

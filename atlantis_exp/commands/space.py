@@ -1,4 +1,4 @@
-"""The space of a search, written as for Hydra's Optuna sweeper and checked before anything starts."""
+"""Read the space of a search, written as for Hydra's Optuna sweeper, and check it before anything starts."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,7 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import Job
 
-_CORNERS = 32  # configs that are composed before a search starts, at 0.1 s each; a larger space is checked by its edges
+_CORNERS = 32  # configs to compose before a search starts, at 0.1 s each; larger spaces are checked along their edges
 _MOST_NUMBERS = 100_000  # of a range with fractions
 
 
@@ -23,26 +23,22 @@ Space = Mapping[str, Distribution]
 
 
 def read_space(texts: Mapping[str, str], closed: set[str]) -> Space:
-    """Return the distributions that the texts describe: `choice(a, b)`, `tag(log, interval(1e-5, 1e-3))`.
+    """Return the distributions of texts as `choice(a, b)` or `tag(log, interval(1e-5, 1e-3))`.
 
     closed: first parts of keys that cannot be searched.
 
     Raises:
-        ConfigError: for such a key, and for a text that is not a set of values.
+        ConfigError: the key is closed, or the text is not a set of values.
     """
     return {key: _read(key, text, closed) for key, text in texts.items()}
 
 
 def _read(key: str, text: str, closed: set[str]) -> Distribution:
     override = read_override(f"{key}={text}")
-    if override.key_or_group != key:  # as `++seed` or `sampler@samplers.uniform`, which MLflow takes no name from
-        raise ConfigError(
-            f"{key}={text}: not to be searched; write a key or a group alone, as in {override.key_or_group}"
-        )
+    if override.key_or_group != key:  # as `++seed` or `sampler@samplers.uniform`, which MLflow refuses as names
+        raise ConfigError(f"{key}={text}: cannot be searched; write a plain key, as in {override.key_or_group}")
     if key.split(".")[0] in closed:
-        raise ConfigError(
-            f"{key}={text}: not to be searched; it says how trials are run or measured, not what is trained"
-        )
+        raise ConfigError(f"{key}={text}: cannot be searched; it decides how trials are run or measured")
     values = override.value()
     if not override.is_sweep_override() or isinstance(values, Glob):
         raise ConfigError(f"{key}={text}: not a set of values; write choice(a, b), range(1, 9) or interval(0.1, 0.9)")
@@ -55,7 +51,7 @@ def _read(key: str, text: str, closed: set[str]) -> Distribution:
                 raise ValueError(f"more than {_MOST_NUMBERS:,} numbers; write interval(a, b)")
             numbers = drawn if isinstance(drawn, range) else [*drawn]
             if not numbers:
-                raise ValueError("it has no numbers")
+                raise ValueError("has no numbers")
             low, high, step = min(numbers[0], numbers[-1]), max(numbers[0], numbers[-1]), abs(values.step)
         else:
             return CategoricalDistribution(list(dict.fromkeys(override.sweep_string_iterator())))
@@ -70,10 +66,10 @@ def _read(key: str, text: str, closed: set[str]) -> Distribution:
 
 
 def check_space(space: Space, overrides: Sequence[str]) -> Job:
-    """Compose the configs at the corners of a space; return the first of them.
+    """Compose the configs at the corners of a space and return the first.
 
     Raises:
-        ConfigError: for the first that is not valid, or a key that has a value already.
+        ConfigError: one is not valid, or a key has a value already.
     """
     fixed = {key_of(text) for text in read_flags(overrides)[0]}
     if twice := sorted(fixed & space.keys()):

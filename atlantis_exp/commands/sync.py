@@ -29,7 +29,6 @@ class SyncConfig:
 
     @property
     def seconds(self) -> int | None:
-        """`every` in seconds."""
         return None if self.every is None else seconds(self.every)
 
 

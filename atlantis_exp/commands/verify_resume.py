@@ -1,4 +1,4 @@
-"""`python -m atlantis_exp verify-resume overrides`: is a training that is killed again and again the unbroken one?"""
+"""`python -m atlantis_exp verify-resume overrides`: is a training that is killed repeatedly the unbroken one?"""
 
 from collections.abc import Callable
 from functools import partial

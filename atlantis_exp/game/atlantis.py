@@ -35,7 +35,7 @@ class Atlantis:
 
     @staticmethod
     def points(reward: int, ram: Sequence[int]) -> Sequence[float]:
-        """The parts of a frame's reward, as `sources`; `ram` is the console's, 128 bytes, after the frame."""
+        """Split a frame's reward by `sources`; `ram` is the console's, 128 bytes, after the frame."""
         if ram[_WAVE_STATE] == _WAVE_OVER:
             return 0, 0, 0, 0, reward
         bombers, vessels = divmod(reward // 100, 10)  # of several hits in one frame the centre gun has one at most

@@ -16,7 +16,7 @@ ALEInterface.setLoggerMode(LoggerMode.Error)  # of the whole process, and before
 
 
 class Step(NamedTuple):
-    """What one step of the agent led to."""
+    """The result of one step of the agent."""
 
     observation: Pixels  # (size, size)
     reward: float  # the game's own, never clipped
@@ -28,7 +28,7 @@ class Step(NamedTuple):
 
 
 def check_game(game: Game) -> None:
-    """Raise ConfigError where ALE has no such ROM, or another screen or other actions for it."""
+    """Raise ConfigError if ALE lacks the ROM, or has another screen or other actions for it."""
     if game.rom not in get_all_rom_ids():
         raise ConfigError(f"{game.rom}: ALE has no ROM of that name")
     ale = ALEInterface()
@@ -42,14 +42,14 @@ def check_game(game: Game) -> None:
 class Emulator:
     """One game, from frames to observations; before its first seed it plays as if seeded with 0.
 
-    game: its ROM, its actions, of which an action is an index, and what pays its points.
+    game: its ROM, its actions (an action is an index of them), and the sources of its points.
     frameskip: frames in a step, or (low, high): drawn from low to high - 1 in every step, as in the report.
     sticky: probability that a frame repeats the action of the one before (Machado et al., 2018).
     max_frames: frames after which an episode is truncated.
     max_steps: steps after which an episode is truncated (27,000 in report figure 1.3), or None.
     noop_max: an episode begins with 1 to `noop_max` frames of NOOP; 0 for none.
     max_pool: a pixel is the brighter of a step's last two frames (Mnih et al., 2015), and a step stops where the
-        episode ends, both as in Gymnasium's `AtariPreprocessing`. Raises ValueError where a step may be one frame.
+        episode ends, both as in Gymnasium's `AtariPreprocessing`. Raises ValueError if a step may be one frame.
     """
 
     def __init__(
@@ -75,22 +75,22 @@ class Emulator:
         self._ale = ALEInterface()
         self._ale.setFloat("repeat_action_probability", sticky)
         self._ale.setInt("max_num_frames_per_episode", max_frames)
-        self._is_loaded = False  # which takes as long as a thousand frames, and a seed needs it anew
+        self._is_loaded = False  # loading takes as long as a thousand frames, and each seed needs it
         self._steps = 0
         self._screen: Pixels = np.zeros((SCREEN_HEIGHT, SCREEN_WIDTH), np.uint8)
         self._pool = preprocessing.grey(self._screen)  # of the last step, cropped; max_pool only
 
     @property
     def lives(self) -> int:
-        """As ALE counts them; in some games they can rise again."""
+        """Lives as ALE counts them; in some games they can rise again."""
         return self._ale.lives()
 
     def screen_rgb(self) -> Pixels:
-        """Returns the frame on screen in colour, (210, 160, 3) uint8."""
+        """Return the frame on screen in colour, (210, 160, 3) uint8."""
         return PALETTE.take(self._screen, axis=0)
 
     def reset(self, seed: int | None = None) -> Pixels:
-        """Begins an episode and returns its first observation; without a seed the random streams go on."""
+        """Begin an episode and return its first observation; without a seed the random streams go on."""
         if seed is not None or not self._is_loaded:
             self._load_game(seed or 0)
         self._keep_origin()
@@ -106,7 +106,7 @@ class Emulator:
         return self.preprocessing.resize(self._pool)
 
     def step(self, action: int) -> Step:
-        """Plays an action for one frameskip; an episode that could be both terminated and truncated is terminated."""
+        """Play an action for one frameskip; an episode that could be both terminated and truncated is terminated."""
         self._played.append(action)
         frameskip = self._frameskip
         if not isinstance(frameskip, int):
@@ -116,7 +116,7 @@ class Emulator:
         if self._max_pool:
             reward = self._act_and_pool(action, frameskip)
         else:
-            # Also past the episode's end, where ALE emulates nothing but still draws for the sticky actions.
+            # Past the episode's end ALE emulates nothing, but still draws for the sticky actions.
             reward = sum(self._act(action) for _ in range(frameskip))
         self._ale.getScreen(self._screen)
         observation = self.preprocessing.resize(self._pool) if self._max_pool else self.preprocessing(self._screen)
@@ -135,8 +135,10 @@ class Emulator:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns how the episode began and its actions: restored into another emulator, ALE's own state is not exact,
-        since its TIA forgets where the graphics registers point and then draws, and collides, differently."""
+        """Return how the episode began and its actions.
+
+        ALE's own state is not exact in another emulator: its TIA forgets where the graphics registers point.
+        """
         return {
             "ale": self._origin,
             "generator": self._generator_origin,
@@ -162,7 +164,7 @@ class Emulator:
             self.step(action)
 
     def _load_game(self, seed: int) -> None:
-        """Starts both random streams, split as in ale_py.env.AtariEnv.seed_game; ALE takes a seed only with a game."""
+        """Start both random streams, as ale_py.env.AtariEnv.seed_game does; ALE takes a seed only with a game."""
         own_seed, ale_seed = np.random.SeedSequence(seed).generate_state(2)
         self._generator = np.random.default_rng(own_seed)
         self._ale.setInt("random_seed", ale_seed.astype(np.int32))
@@ -178,7 +180,7 @@ class Emulator:
         self._played = bytearray()  # actions since the origin
 
     def _act(self, action: int) -> int:
-        """Plays one frame and returns its reward, which is added to the step's points by source."""
+        """Play one frame and return its reward; add it to the step's points by source."""
         reward = self._ale.act(self._actions[action])
         if reward and self.game.points is not None:
             for source, points in enumerate(self.game.points(reward, self._ale.getRAM())):
@@ -186,7 +188,7 @@ class Emulator:
         return reward
 
     def _act_and_pool(self, action: int, frameskip: int) -> int:
-        """Returns the reward; a step cut short pools with the step before, as in `AtariPreprocessing`."""
+        """Return the reward; a step cut short pools with the step before, as in `AtariPreprocessing`."""
         reward = 0
         before_last = last = self._pool
         for left in reversed(range(frameskip)):
@@ -201,7 +203,7 @@ class Emulator:
 
 
 def query_environment(name: str) -> dict[str, object]:
-    """Returns what Gymnasium says of an Atari environment (report figures 1.1 to 1.3), with its cap on frames.
+    """Return Gymnasium's facts of an Atari environment (report figures 1.1 to 1.3), with its cap on frames.
 
     The reward range is gym's default: Atari never narrowed it, and Gymnasium 1.0 dropped the attribute.
     """

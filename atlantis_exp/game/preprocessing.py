@@ -1,4 +1,4 @@
-"""From a screen of the Atari 2600 to an observation, and from observations to a state."""
+"""Turn screens of the Atari 2600 into observations, and observations into states."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class Preprocessing:
 
     Grey, crop, area interpolation: within one grey level of 255 times the float of report figure 2.3. `crop` is its
     `exclude`, (UP, RIGHT, DOWN, LEFT) in pixels: rows UP to DOWN - 1 and columns LEFT to RIGHT - 1 stay. Raises
-    ValueError if that is no part of the screen.
+    ValueError if it leaves the screen.
     """
 
     size: int
@@ -47,18 +47,18 @@ class Preprocessing:
     def __post_init__(self) -> None:
         up, right, down, left = self.crop
         if not (0 <= up < down <= SCREEN_HEIGHT and 0 <= left < right <= SCREEN_WIDTH):
-            raise ValueError(f"crop (UP, RIGHT, DOWN, LEFT) = {self.crop} is no part of a 210x160 screen")
+            raise ValueError(f"crop (UP, RIGHT, DOWN, LEFT) = {self.crop} is not inside a 210x160 screen")
 
     def __call__(self, screen: Pixels) -> Pixels:
         return self.resize(self.grey(screen))
 
     def grey(self, screen: Pixels) -> Pixels:
-        """Returns the crop of a screen of palette indices in grey, (DOWN - UP, RIGHT - LEFT) uint8."""
+        """Return the crop of a screen of palette indices in grey, (DOWN - UP, RIGHT - LEFT) uint8."""
         up, right, down, left = self.crop
         return cast(Pixels, cv2.LUT(screen[up:down, left:right], GREY))
 
     def resize(self, grey: Pixels) -> Pixels:
-        """Returns a crop in grey at the observation's size, (size, size) uint8."""
+        """Return a crop in grey at the observation's size, (size, size) uint8."""
         return cast(Pixels, cv2.resize(grey, (self.size, self.size), interpolation=cv2.INTER_AREA))
 
 
@@ -73,11 +73,11 @@ class FrameStack:
         self.state: Pixels = np.zeros((num_envs, stack, size, size), np.uint8)
 
     def reset(self, envs: Envs, observations: Pixels) -> Pixels:
-        """Begins an episode in `envs` with these observations, (len(envs), size, size); returns the state of all."""
+        """Begin an episode in `envs` with these observations, (len(envs), size, size); return the state of all."""
         return self._replace(envs, observations[:, np.newaxis])
 
     def push(self, observations: Pixels, envs: Envs | None = None) -> Pixels:
-        """Appends these observations, (len(envs), size, size), in `envs`, by default all; returns the state of all."""
+        """Append these observations, (len(envs), size, size), in `envs`, by default all; return the state of all."""
         older = self.state if envs is None else self.state[np.asarray(envs, np.intp)]
         stacks = np.concatenate([older[:, 1:], observations[:, np.newaxis]], axis=1)
         if envs is None:
@@ -90,7 +90,7 @@ class FrameStack:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         if (state["state"].shape, state["state"].dtype) != (self.state.shape, np.uint8):
-            raise ValueError("the stacks are not of this game's form")
+            raise ValueError("the stacks do not have this game's shape")
         self.state = state["state"]
 
     def _replace(self, envs: Envs, stacks: Pixels) -> Pixels:

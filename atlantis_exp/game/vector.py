@@ -1,4 +1,4 @@
-"""Many emulators, here or in worker processes; neither the number of these nor timing changes a result."""
+"""Many emulators, here or in worker processes; neither their number nor timing changes a result."""
 
 import atexit
 import multiprocessing
@@ -38,7 +38,7 @@ class WorkerDied(RunFault):
 
 
 class Steps(NamedTuple):
-    """A step of several environments, in the order they were named; the arrays are the caller's."""
+    """A step of several environments, in the order of the call; the arrays are copies."""
 
     observations: Pixels  # (len(envs), size, size)
     rewards: npt.NDArray[np.float64]
@@ -52,25 +52,25 @@ class Steps(NamedTuple):
 class Emulators(ABC):
     """Emulators of environments 0 to num_envs - 1, all of one game; none begins an episode by itself.
 
-    `envs` are distinct, by default all. Several steps can be under way, of different environments each. Raises
-    RuntimeError where one is called whose step was sent and not received. `stop` is asked while a worker hangs.
+    `envs` are distinct, by default all. Several steps can be under way, of different environments each; a call of one
+    whose step was not received yet raises RuntimeError. `stop` is asked while a worker hangs.
     """
 
     def __init__(self, num_envs: int, game: Game, rows: Rows) -> None:
         self.num_envs, self.game = num_envs, game
         self.stop: Callable[[], bool] = lambda: False
         self._rows = rows
-        self._sent: deque[Envs] = deque()  # the environments of each step that was sent and not received
-        self._unheard = 0  # how many of these, the latest, were not waited for
+        self._sent: deque[Envs] = deque()  # the environments of each step that was not received yet
+        self._unheard = 0  # the latest of these that were not waited for
 
     def reset(self, envs: Envs, seeds: Sequence[int | None] | None = None) -> Pixels:
-        """Begins an episode in each of `envs` and returns the first observations, (len(envs), size, size)."""
+        """Begin an episode in each of `envs`; return the first observations, (len(envs), size, size)."""
         seeds = [None] * len(envs) if seeds is None else seeds
         self._call("reset", {int(env): (seed,) for env, seed in zip(envs, seeds, strict=True)})
         return self._columns(envs).observations
 
     def send(self, actions: Sequence[int] | npt.NDArray[np.int64], envs: Envs | None = None) -> None:
-        """Starts a step of `envs` with one action each."""
+        """Start a step of `envs` with one action each."""
         envs = range(self.num_envs) if envs is None else envs
         calls: Calls = {int(env): (int(action),) for env, action in zip(envs, actions, strict=True)}
         self._refuse_sent(calls)
@@ -79,14 +79,14 @@ class Emulators(ABC):
         self._unheard += 1
 
     def receive(self) -> Steps:
-        """Waits for the first of the steps that were sent and returns it."""
+        """Wait for the oldest step that was sent and return it."""
         if not self._sent:
             raise RuntimeError("no step was sent")
         self._wait(unheard=len(self._sent) - 1)
         return self._columns(self._sent.popleft())
 
     def step(self, actions: Sequence[int] | npt.NDArray[np.int64], envs: Envs | None = None) -> Steps:
-        """Plays a step of `envs` with one action each; none may be under way."""
+        """Play a step of `envs` with one action each; none may be under way."""
         self._refuse_sent(range(self.num_envs))
         self.send(actions, envs)
         return self.receive()
@@ -108,14 +108,14 @@ class Emulators(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Ends what runs outside this process; a second call does nothing."""
+        """End the worker processes; a second call does nothing."""
 
     @abstractmethod
     def _start(self, method: str, calls: Calls) -> None: ...
 
     @abstractmethod
     def _results(self) -> dict[int, Any]:
-        """Waits for the first of the calls that were started; what it returns by environment, but for the rows."""
+        """Wait for the oldest call and return its results by environment, but for those in the rows."""
 
     def _call(self, method: str, calls: Calls) -> dict[int, Any]:
         self._refuse_sent(calls)
@@ -158,30 +158,30 @@ class SerialEmulators(Emulators):
 class ProcessEmulators(Emulators):
     """Emulators in worker processes, which play between `send` and `receive`.
 
-    Steps come through shared memory without a name, all else through pipes. Workers leave signals to this process and
-    end when it does. Waiting for one that has ended or hangs raises WorkerDied, once the others are ended too.
+    Steps come through nameless shared memory, all else through pipes. Workers ignore signals and end with this process.
+    Waiting for one that has ended or hangs ends the others and raises WorkerDied.
     """
 
     patience = 60.0  # seconds that a worker may neither answer nor use the processor
 
     def __init__(self, make: Callable[[], Emulator], num_envs: int, workers: int) -> None:
-        row = _row(first := make())  # and what `make` raises, it raises here
+        row = _row(first := make())  # errors of `make` are raised here
         context = multiprocessing.get_context("spawn")  # torch's threads make a fork unsafe
         memory = context.RawArray(c_ubyte, num_envs * row.itemsize)
         super().__init__(num_envs, first.game, np.frombuffer(memoryview(memory), row))
         self._envs = [range(worker, num_envs, workers) for worker in range(workers)]
         self._connections: list[Connection[Any, Any]] = []
         self._processes: list[multiprocessing.context.SpawnProcess] = []
-        self._polls: list[select.poll] = []  # of the connections, since theirs takes as long as a step
+        self._polls: list[select.poll] = []  # connection.poll would take as long as a step
         cores = _cores_for(workers)
-        atexit.register(self.close)  # multiprocessing's own exit waits for workers that are deaf to its SIGTERM
+        atexit.register(self.close)  # at exit multiprocessing waits for its SIGTERM, which workers ignore
         with _signals_held():
             for worker, envs in enumerate(self._envs):
                 connection, theirs = context.Pipe()
                 core = cores[worker % len(cores)] if cores else None
                 process = context.Process(target=_work, args=(core, theirs, make, envs, memory, row), daemon=True)
                 process.start()
-                theirs.close()  # the worker now holds the only other end, so its death ends the pipe
+                theirs.close()  # the worker holds the only other end: its death ends the pipe
                 self._connections.append(connection)
                 self._polls.append(select.poll())
                 self._polls[-1].register(connection, select.POLLIN)
@@ -196,7 +196,7 @@ class ProcessEmulators(Emulators):
 
     def _start(self, method: str, calls: Calls) -> None:
         for envs, connection in zip(self._envs, self._connections, strict=True):
-            with suppress(ConnectionError):  # the worker has died; why, its last answer or the lack of one tells
+            with suppress(ConnectionError):  # the worker has died, which `_results` explains
                 connection.send((method, {env: calls[env] for env in envs if env in calls}))
 
     def _results(self) -> dict[int, Any]:
@@ -213,16 +213,16 @@ class ProcessEmulators(Emulators):
         return results
 
     def _wait_for(self, worker: int) -> str:
-        """Wait for a worker's answer; return why no longer, empty if there is one.
+        """Wait for a worker's answer; return the reason to give up, empty if it has answered or died.
 
-        Seconds are counted by looks: a process that was suspended together with its workers has not waited.
+        Seconds are counted by polls, so that they stop while this process is suspended.
         """
         idle, used = 0, -1.0
         while not self._polls[worker].poll(1_000):  # ms
             try:
                 times = psutil.Process(self._processes[worker].pid).cpu_times()
             except psutil.Error:
-                return ""  # it has died, which the connection tells
+                return ""  # it has died
             idle, used = (idle + 1, used) if times.user + times.system == used else (0, times.user + times.system)
             if idle >= self.patience or (idle >= _LAST_SECONDS and self.stop()):
                 return f"no answer and no work for {idle} s"
@@ -230,9 +230,9 @@ class ProcessEmulators(Emulators):
 
 
 def make_emulators(make: Callable[[], Emulator], num_envs: int, workers: int) -> Emulators:
-    """Returns `num_envs` emulators that `make`, a picklable call, builds in `workers` processes.
+    """Return `num_envs` emulators that `make`, a picklable call, builds in `workers` processes.
 
-    A single environment, or no worker, stays in this process.
+    A single environment stays in this process, as do all without workers.
     """
     if num_envs == 1 or workers == 0:
         return SerialEmulators(make, num_envs)
@@ -241,10 +241,10 @@ def make_emulators(make: Callable[[], Emulator], num_envs: int, workers: int) ->
 
 @contextmanager
 def _signals_held() -> Iterator[None]:
-    """Has the signals that are the parent's wait for the block's end, and for processes begun in it to ignore them."""
+    """Hold back the parent's signals until the block ends and its new processes ignore them."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _FOR_THE_PARENT)
     try:
-        resource_tracker.ensure_running()  # which every first process would start, and which lets some of them through
+        resource_tracker.ensure_running()  # the first process would start it, and it unblocks some signals
         signal.pthread_sigmask(signal.SIG_BLOCK, _FOR_THE_PARENT)
         yield
     finally:
@@ -258,7 +258,7 @@ def _row(emulator: Emulator) -> np.dtype[np.void]:
 
 
 def _play(emulators: dict[int, Emulator], rows: Rows, method: str, calls: Calls) -> dict[int, Any]:
-    """Calls a method of emulators; steps and first observations go into the rows, all else is returned."""
+    """Call a method of emulators; write steps and first observations to the rows, return other results."""
     returned = {}
     for env, arguments in calls.items():
         result = getattr(emulators[env], method)(*arguments)
@@ -272,9 +272,9 @@ def _play(emulators: dict[int, Emulator], rows: Rows, method: str, calls: Calls)
 
 
 def _cores_for(workers: int) -> list[int]:
-    """The core of each worker: woken together, they would otherwise begin on the core of whoever wakes them.
+    """Return the core of each worker: woken together, they would all begin on one.
 
-    An empty list, any core for all, where there are fewer workers than cores: parallel runs would share the same few.
+    Return an empty list (any core) if there are fewer workers than cores: parallel runs would share the same few.
     """
     if not hasattr(os, "sched_getaffinity"):  # no Linux
         return []
@@ -290,7 +290,7 @@ def _work(
     memory: "Array[c_ubyte]",
     row: np.dtype[np.void],
 ) -> None:
-    """Plays what the parent asks for until it closes the pipe or dies; an error is the last answer."""
+    """Answer the parent's calls until it closes the pipe or dies; the last answer may be an error."""
     for number in _FOR_THE_PARENT:
         signal.signal(number, signal.SIG_IGN)
     cv2.setNumThreads(1)

@@ -23,27 +23,25 @@ class Learner(ActionValues):
     """Learns action values by gradient steps on `network`, which `target` follows by a share `tau` (report figure 2.5).
 
     `target` moves after every `target_every` updates: with tau below 1 it follows softly, with tau 1 it is a copy.
-    Both networks lie on one device, which is where the learner works; `target` is by custom a copy of `network`.
-    Weights are float32. With precision "bf16" the forward and backward passes run in bfloat16, the loss, the optimizer
-    and the soft update in float32.
+    Both networks lie on one device; weights are float32. With precision "bf16" the forward and backward passes run in
+    bfloat16, the loss, the optimizer and the soft update in float32.
 
-    With several shards a batch is cut into as many parts, each a thread's own from the states to the gradients. Threads
-    then wait for each other once an update, where torch's own wait after every operation: as fast on a quiet machine
-    and several times faster where other programs want the cores too (docs/performance.md). Raises ValueError unless the
-    network's class says `splits_batches`: samples must meet in no batch statistics, masks come from no one generator.
+    With several shards a batch is cut into parts, each computed by one thread from the states to the gradients. Threads
+    then wait for each other once an update instead of after every operation: as fast on a quiet machine, several times
+    faster on a busy one (docs/performance.md). Raises ValueError unless the network's class says `splits_batches`: no
+    batch norm, no shared dropout generator.
 
-    The network is in eval mode but for its pass over s_t: acting draws no dropout mask and moves no running statistics.
-    The target network is in eval mode too, and its running statistics follow the network's as its parameters do. The
-    report leaves it in train mode (dropout and batch statistics in its targets) and moves its parameters alone:
-    target_mode "train".
+    The network is in train mode for its pass over s_t alone, the target network never: its running statistics follow
+    the network's as its parameters do. The report leaves it in train mode (dropout and batch statistics in its targets)
+    and moves its parameters alone: target_mode "train".
 
     `evaluated` is the network to evaluate: the online one or, with `ema`, an exponential moving average of its weights
-    over about as many updates, of which learning and acting know nothing.
+    over about as many updates, which does not influence learning.
 
     Statistics gather on the device: `update` never waits for it, and a GPU is sent batches from pinned memory.
 
-    compile: what makes faster modules of both networks for updates, as torch.compile does; acting goes without, since
-    its batches differ in size.
+    compile: makes faster modules of both networks for updates, as torch.compile does; the batches of acting differ in
+    size.
     """
 
     def __init__(
@@ -77,7 +75,7 @@ class Learner(ActionValues):
         )
         self.target_mode = target_mode
         self.updates = 0
-        self._has_begun_with = False  # weights that were given, which the average holds, too
+        self._has_begun_with = False  # given weights, which the average holds, too
         self._sums = torch.zeros(len(_MEASURES), device=self.device)
         self._measured = 0  # updates in the sums
         self._first_nonfinite = torch.full((), -1, device=self.device)
@@ -126,7 +124,7 @@ class Learner(ActionValues):
 
     def _move_average(self) -> None:
         if self.ema and self.updates % _AVERAGE_EVERY == 0:
-            # From random weights, a plain mean of all so far, until there are as many as are asked for.
+            # From random weights, a plain mean of all so far until there are `ema` of them.
             first = 0.0 if self._has_begun_with else _AVERAGE_EVERY / self.updates
             share = max(first, _AVERAGE_EVERY / self.ema)
             _follow(self.evaluated, self.network, share, buffers=True)
@@ -143,8 +141,7 @@ class Learner(ActionValues):
         discount: npt.NDArray[np.floating],
         weights: npt.NDArray[np.floating],
     ) -> tuple[list[torch.Tensor], torch.Tensor, torch.Tensor]:
-        """Return a shard's part of the batch's gradients, in float32, of its mean loss, value and target, and of its
-        errors."""
+        """Return a shard's part of the float32 gradients, of the mean loss, value and target, and of the errors."""
         online, target_network = self._online_passes[shard], self._target_passes[shard]
         actions = self._sent(a_t).to(torch.int64)
         rewards, discounts, importance = (self._sent(array).to(torch.float32) for array in (r_t, discount, weights))
@@ -185,7 +182,7 @@ class Learner(ActionValues):
 
     @contextmanager
     def restored(self) -> Iterator[None]:
-        """Let the block update the learner, which is then put back as it was."""
+        """Restore the learner after the block."""
         state = copy.deepcopy(self.state_dict())
         yield
         self.load_state_dict(state)
@@ -193,8 +190,7 @@ class Learner(ActionValues):
     def update_flops(self, state: tuple[int, int, int], batch_size: int) -> int:
         """Return the floating-point operations of one update on batches of states (C, H, W); changes nothing.
 
-        Two a multiply-add, in convolutions and matrix products alone: forward, backward and the objective's passes,
-        whatever they are.
+        Counts convolutions and matrix products in all passes, a multiply-add as two.
         """
         passes = self._online_passes, self._target_passes
         # The counter sees neither other threads nor compiled networks.
@@ -206,10 +202,9 @@ class Learner(ActionValues):
         return int(counter.get_total_flops() * batch_size // 2)
 
     def statistics(self) -> dict[str, float]:
-        """Return the means over the updates since the last call and start anew; waits for the device.
+        """Return the means over the updates since the last call, empty if there was none; waits for the device.
 
-        Loss and the norm of its gradient; q, the values of all actions at s_t; target, what they are drawn to. Empty
-        if there was no update.
+        Loss and the norm of its gradient; q, the values of all actions at s_t; target, the values they are drawn to.
         """
         if self._measured == 0:
             return {}
@@ -219,16 +214,12 @@ class Learner(ActionValues):
         return dict(zip(_MEASURES, means, strict=True))
 
     def first_nonfinite_update(self) -> int | None:
-        """Return the index of the first update whose loss was infinite or no number, None if all were finite; waits
-        for the device."""
+        """Return the index of the first update whose loss was not finite, or None; waits for the device."""
         index = int(self._first_nonfinite)
         return None if index < 0 else index
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that a continuation needs; the optimizer's settings but its learning rate are the caller's.
-
-        Tensors are the live ones: write or copy them before the next update.
-        """
+        """Return the state without the optimizer's settings; write or copy the live tensors before the next update."""
         return {
             "network": self.network.state_dict(),
             "target": self.target.state_dict(),
@@ -244,17 +235,13 @@ class Learner(ActionValues):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where the learner stood that `state_dict` described.
-
-        Raises:
-            ValueError: where the next update would break off.
-        """
+        """Continue from a state that `state_dict` returned. Raises: ValueError if the next update would fail."""
         kept = {int(index): values for index, values in state["optimizer"].items()}
         self.network.load_state_dict(state["network"])
         self.target.load_state_dict(state["target"])
         self.optimizer.load_state_dict(
             {
-                "state": copy.deepcopy(kept),  # since the optimizer keeps what it is given
+                "state": copy.deepcopy(kept),  # the optimizer keeps its argument
                 "param_groups": self.optimizer.state_dict()["param_groups"],
             }
         )
@@ -275,15 +262,13 @@ class Learner(ActionValues):
         self._target.refresh()
 
     def _check_optimizer(self) -> None:
-        """Compare what the optimizer has loaded with what it keeps after a step; torch does not. Raises: ValueError."""
+        """Compare the shapes of the loaded state with those after a step; torch does not. Raises: ValueError."""
 
-        def form(optimizer: torch.optim.Optimizer) -> dict[int, dict[str, object]]:
-            state = optimizer.state_dict()["state"].items()
+        def form(optimizer: torch.optim.Optimizer) -> dict[tuple[int, str], object]:
             return {
-                index: {
-                    name: isinstance(value, torch.Tensor) and (value.shape, value.dtype) for name, value in kept.items()
-                }
-                for index, kept in state
+                (index, name): isinstance(value, torch.Tensor) and (value.shape, value.dtype)
+                for index, kept in optimizer.state_dict()["state"].items()
+                for name, value in kept.items()
             }
 
         trial = copy.deepcopy(self.optimizer)
@@ -305,11 +290,8 @@ class Learner(ActionValues):
 
     def _generators(self) -> dict[str, torch.Generator]:
         """Return the random streams of both networks."""
-        return {
-            f"{role}.{name}": generator
-            for role, network in (("network", self.network), ("target", self.target))
-            for name, generator in generators_of(network)
-        }
+        both = {"network": self.network, "target": self.target}
+        return {f"{role}.{name}": each for role, network in both.items() for name, each in generators_of(network)}
 
 
 def _summed(gradients: Sequence[list[torch.Tensor]]) -> list[torch.Tensor]:

@@ -1,4 +1,4 @@
-"""What an update minimises: targets to reach at s_t, and the loss of missing them."""
+"""Objectives: the targets of an update, and the loss."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -94,8 +94,8 @@ class DoubleQuantile(Quantile, DoubleDQN):
 
 @dataclass(frozen=True)
 class _Rescaled(DQN):
-    """Learns h(return) for an h that makes large returns small, so that rewards need no clip; h is undone before
-    rewards are added (Pohlen et al. 2018, equation 5)."""
+    """Learns h(return), which makes large returns small; h is undone before rewards are added (Pohlen et al. 2018,
+    equation 5)."""
 
     rescaling: Rescaling
 
@@ -115,7 +115,7 @@ class RescaledDoubleDQN(_Rescaled, DoubleDQN):
 class RescaledQuantile(_Rescaled, Quantile):
     """QR-DQN on rescaled returns, whose quantiles are those of the returns, rescaled.
 
-    Actions are chosen by the mean of what is learned, which is below the rescaled mean where returns vary.
+    Actions are chosen by the mean of the rescaled quantiles, which is below the rescaled mean if returns vary.
     """
 
 
@@ -128,7 +128,7 @@ def signed_sqrt(x: torch.Tensor) -> torch.Tensor:
 
 
 def undo_signed_sqrt(x: torch.Tensor) -> torch.Tensor:
-    """Return what `signed_sqrt` makes x of (Pohlen et al. 2018, proposition A.2)."""
+    """Return the inverse of `signed_sqrt` (Pohlen et al. 2018, proposition A.2)."""
     inside = x.abs() + 1 + _EPSILON
     # The paper's (root - 1) / (2 epsilon) times (root + 1) / (root + 1): in float32 the difference loses digits.
     return x.sign() * ((2 * inside / ((1 + 4 * _EPSILON * inside).sqrt() + 1)) ** 2 - 1)
@@ -140,7 +140,7 @@ def symlog(x: torch.Tensor) -> torch.Tensor:
 
 
 def undo_symlog(x: torch.Tensor) -> torch.Tensor:
-    """Return what `symlog` makes x of."""
+    """Return the inverse of `symlog`."""
     return x.sign() * x.abs().expm1()
 
 
@@ -154,12 +154,12 @@ def td_errors(q: torch.Tensor, a_t: torch.Tensor, target: torch.Tensor) -> torch
 
 
 def taken(q: torch.Tensor, a_t: torch.Tensor) -> torch.Tensor:
-    """Return what q, (B, A) or (B, A, N), holds for one action of each sample."""
+    """Return the part of q, (B, A) or (B, A, N), of one action of each sample."""
     return q[torch.arange(len(a_t), device=q.device), a_t]
 
 
 def bootstrapped(r_t: torch.Tensor, discount: torch.Tensor, v_tpm: torch.Tensor) -> torch.Tensor:
-    """Return rewards plus discounted values (B,) or quantiles (B, N), and whatever these are, rewards alone where the
-    discount is 0."""
+    """Return rewards plus discounted values (B,) or quantiles (B, N); rewards alone if the discount is 0, even for
+    infinite values."""
     r_t, discount = (each.view(-1, *(1 for _ in v_tpm.shape[1:])) for each in (r_t, discount))
     return torch.where(discount == 0, r_t, r_t + discount * v_tpm)

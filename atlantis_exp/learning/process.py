@@ -1,11 +1,11 @@
-"""What holds for all of a process that learns: torch's threads, bits that repeat, memory."""
+"""Set up a process that learns: torch's threads, determinism, memory."""
 
 import ctypes
 
 import torch
 
 OWN_THREADS = torch.get_num_threads()
-"""Torch's own choice, before anything here changes it."""
+"""Torch's default number of threads."""
 
 # malloc.h
 _M_TRIM_THRESHOLD = -1
@@ -13,19 +13,18 @@ _M_MMAP_MAX = -4
 
 
 def set_up_process(threads: int) -> None:
-    """Set torch's threads in this process, have it repeat its bits, and keep the memory that it frees."""
+    """Set torch's threads, make it deterministic, and keep the memory that it frees."""
     torch.set_num_threads(threads)
-    torch.backends.cudnn.deterministic = True  # on a GPU, where else some kernels add in any order
-    torch.backends.cudnn.allow_tf32 = False  # there, fp32 is no TensorFloat-32 by another name
+    torch.backends.cudnn.deterministic = True  # some kernels of a GPU add in any order otherwise
+    torch.backends.cudnn.allow_tf32 = False  # fp32 means float32, not TensorFloat-32
     keep_freed_memory()
 
 
 def keep_freed_memory() -> None:
     """Let glibc's malloc keep freed memory for the next allocation; without glibc, do nothing.
 
-    Every update frees and asks again for hundreds of megabytes, a sixth of its time on a CPU. By default these go back
-    to the system, to come again page by page: 20,000 faults an update of ResNetDQN. Holds for the whole process, whose
-    memory then never shrinks.
+    An update frees and allocates hundreds of megabytes, which would come back page by page: 20,000 faults an update of
+    ResNetDQN, a sixth of its time on a CPU. The memory of the process then never shrinks.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:

@@ -1,4 +1,4 @@
-"""A network's action values, computed on all cores."""
+"""Compute a network's action values on all cores."""
 
 import copy
 from collections.abc import Callable, Iterator, Sequence
@@ -18,17 +18,16 @@ T = TypeVar("T")
 
 
 def generators_of(network: nn.Module) -> Iterator[tuple[str, torch.Generator]]:
-    """Yield whatever the modules of a network hold as `generator`."""
+    """Yield the attribute `generator` of each module of a network that has one."""
     for name, module in network.named_modules():
         if isinstance(generator := getattr(module, "generator", None), torch.Generator):
             yield name, generator
 
 
 class Replicas:
-    """Copies of a network for a thread each, which share buffers, generators and weights in the precision of the pass.
+    """Copies of a network, one a thread, that share buffers, generators and weights in the precision of the pass.
 
-    In bfloat16 these are the weights of layers with matrices; what normalises stays float32. `refresh` them when the
-    network's own have moved.
+    In bfloat16 only layers with matrices are cast; normalisation stays float32. `refresh` them after an update.
     """
 
     def __init__(self, network: nn.Module, dtype: torch.dtype, count: int) -> None:
@@ -62,11 +61,7 @@ class Replicas:
 
 
 class ActionValues:
-    """Asks a network, in eval mode and on the device where it lies, what actions are worth.
-
-    precision and shards are as a learner's; raises ValueError for several shards unless the network's class says
-    `splits_batches`.
-    """
+    """The action values of a network in eval mode, on its device; precision, shards and errors as of `Learner`."""
 
     def __init__(self, network: nn.Module, *, precision: Literal["fp32", "bf16"] = "fp32", shards: int = 1) -> None:
         self.network = network.eval()
@@ -105,7 +100,7 @@ class ActionValues:
     def _input(self, states: npt.NDArray[np.uint8]) -> torch.Tensor:
         """Return states in [0, 1] in the precision of the forward pass, channels last."""
         batch, channels, height, width = states.shape
-        # Channels move while they are bytes, by OpenCV: torch takes longer than for all the rest of this.
+        # OpenCV moves channels of bytes: torch takes longer for it than for the rest of this function.
         bytes_BHWC = cv2.merge([states[:, channel].reshape(-1, width) for channel in range(channels)])
         x_BHWC = self._sent(bytes_BHWC.reshape(batch, height, width, channels))
         return x_BHWC.to(self.dtype).div_(255).permute(0, 3, 1, 2)
@@ -114,5 +109,5 @@ class ActionValues:
         tensor = torch.from_numpy(array)
         if self.device.type != "cuda":
             return tensor.to(self.device)
-        # From memory that may be paged out, a copy to a GPU waits for all that was asked of the GPU before.
+        # A copy from pageable memory waits for all earlier work of the GPU.
         return tensor.pin_memory().to(self.device, non_blocking=True)

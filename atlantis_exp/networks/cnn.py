@@ -28,7 +28,7 @@ class DQNCnn(nn.Module):
             nn.Conv2d(32, 64, kernel_size=4, stride=2),  # 9x9
             nn.ReLU(),
             nn.Conv2d(64, 64, kernel_size=3, stride=1),  # 7x7
-            nn.Flatten(),  # ahead of the ReLU, whose gradient else waits for channels that move
+            nn.Flatten(),  # before the ReLU, whose gradient would otherwise wait for moving channels
             nn.ReLU(),
         )
         self.feature_size = 64 * _last_side(height) * _last_side(width)
@@ -39,7 +39,7 @@ class DQNCnn(nn.Module):
         )
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        # On CPUs with AVX-512 an update is 9 % faster so in float32; in bfloat16 it is all one.
+        # On CPUs with AVX-512 this makes an update 9 % faster in float32; in bfloat16 there is no difference.
         x = x.contiguous(memory_format=torch.channels_last)
         q: torch.Tensor = self.fc(self.features(x))
         return q

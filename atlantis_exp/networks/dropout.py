@@ -7,7 +7,7 @@ from torch import nn
 class Dropout(nn.Dropout):
     """Dropout that draws its masks from `generator` and never from torch's global one; in eval mode the identity.
 
-    The generator is no part of the weights (`state_dict`): whoever continues a training saves and restores its state.
+    The generator is not in the `state_dict` of weights: the learner saves and restores its state.
     """
 
     def __init__(self, p: float) -> None:

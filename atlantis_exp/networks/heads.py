@@ -1,4 +1,4 @@
-"""The last layer of a network: from features to action values, or to quantiles of them."""
+"""Heads: the last layer of a network, from features to action values or their quantiles."""
 
 from collections.abc import Callable
 from typing import TypeAlias

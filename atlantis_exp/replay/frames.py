@@ -12,9 +12,8 @@ from atlantis_exp.faults import Fault
 class FrameStore:
     """Ring of compressed uint8 frames with consecutive ids that never takes more than `budget_bytes`.
 
-    Every frame is one LZ4 block whose dictionary is the first frame ever encoded: whatever of the background stays as
-    it was at the start of play costs next to nothing (without a crop half of all bytes), and decoding is as
-    fast. Memory that frames have not reached yet is reserved but not resident.
+    Every frame is one LZ4 block whose dictionary is the first frame ever encoded: a background that stays the same
+    costs next to nothing (without a crop half of all bytes). Unused memory is reserved but not resident.
 
     Args:
         capacity: most frames held.
@@ -22,7 +21,7 @@ class FrameStore:
         budget_bytes: bound on buffer and index together.
 
     Raises:
-        ValueError: the budget does not hold even eight frames of noise, two states of four.
+        ValueError: the budget does not hold eight frames of noise, two states of four.
     """
 
     def __init__(self, capacity: int, frame_shape: tuple[int, ...], budget_bytes: int) -> None:
@@ -57,11 +56,7 @@ class FrameStore:
         return self._starts.nbytes + self._lengths.nbytes + self._used_bytes
 
     def encode(self, frame: npt.NDArray[np.uint8]) -> bytes:
-        """Compress one frame; the first one ever becomes the dictionary.
-
-        Raises:
-            ValueError: `frame` is not uint8 or not of `frame_shape`.
-        """
+        """Compress one frame of `frame_shape`, uint8; the first one ever becomes the dictionary. Raises: ValueError."""
         if frame.shape != self.frame_shape or frame.dtype != np.uint8:
             raise ValueError(f"replay holds uint8 frames of {self.frame_shape}, not {frame.dtype} of {frame.shape}")
         frame = np.ascontiguousarray(frame)
@@ -84,11 +79,7 @@ class FrameStore:
         self.next_id += 1
 
     def decode(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
-        """Return the frames of stored `ids` as a fresh array of shape `(*ids.shape, *frame_shape)`.
-
-        Raises:
-            Fault: a loaded segment holds bytes that are not a frame.
-        """
+        """Return the frames of stored `ids`, (*ids.shape, *frame_shape). Raises: Fault for damaged bytes."""
         size = self.frame_bytes
         frames = np.empty((*ids.shape, *self.frame_shape), np.uint8)
         target = frames.reshape(-1).data
@@ -99,8 +90,7 @@ class FrameStore:
                 target[i * size : (i + 1) * size] = frame
             except (lz4.block.LZ4BlockError, ValueError) as error:
                 raise Fault(
-                    f"the replay memory holds bytes that are not an observation ({error}); resume=never keeps what is "
-                    "there and begins anew"
+                    f"the replay memory is damaged ({error}); resume=never keeps this run and begins anew"
                 ) from None
         return frames
 
@@ -109,7 +99,7 @@ class FrameStore:
         ids = np.arange(first_id, self.next_id)
         spans = self._spans(ids)
         wraps = np.flatnonzero(spans[1:, 0] != spans[:-1, 1]) + 1
-        # Whole stretches of the ring: an object for every frame keeps the garbage collector busy for seconds.
+        # Whole stretches of the ring: an object a frame keeps the garbage collector busy for seconds.
         stretches = (self._buffer[span[0, 0] : span[-1, 1]] for span in np.split(spans, wraps) if len(span))
         return self._lengths[ids % self.capacity], np.frombuffer(bytearray().join(stretches), np.uint8)
 

@@ -22,12 +22,11 @@ _SEGMENT_DTYPES = _ENTRY_DTYPES | {"data": np.uint8, "dictionary": np.uint8, "en
 
 @dataclass(frozen=True)
 class Returns:
-    """What a transition is worth: up to `n_step` rewards, then the value of the state after them.
+    """The n-step return of a transition: up to `n_step` rewards, then the value of the state after them.
 
-    The memory keeps the game's rewards; the learner's are those times `scale`, their size then to the power of
-    `exponent`, then clipped to -`clip`..`clip`. They are summed with discount `gamma` a step. Where an episode ends or
-    has come no further yet, the rewards are fewer and what follows is discounted less; after a terminal step nothing
-    follows.
+    The memory keeps the game's rewards. The learner's are those times `scale`, their size to the power of `exponent`,
+    clipped to -`clip`..`clip`, summed with discount `gamma` a step. At an episode's end so far there are fewer rewards;
+    after a terminal step no value follows.
     """
 
     gamma: float
@@ -51,7 +50,7 @@ class Transitions(NamedTuple):
     a_t: npt.NDArray[np.int64]  # (B,)
     r_t: npt.NDArray[np.float32]  # (B,), the discounted sum of m rewards
     s_tpm: npt.NDArray[np.uint8]  # (B, stack, H, W)
-    discount: npt.NDArray[np.float32]  # (B,), of what follows s_tpm: gamma**m, 0 after a terminal step
+    discount: npt.NDArray[np.float32]  # (B,), of the value of s_tpm: gamma**m, 0 after a terminal step
 
 
 class ReplayMemory:
@@ -59,8 +58,8 @@ class ReplayMemory:
 
     An entry is an observation with the step that led to it: its action, reward, whether it is terminal, and `back`,
     the distance in ids to the observation before it (0: an episode's first). Entries never change once appended. A
-    transition bears the id of its state's newest observation; it is available while it has a successor and all frames
-    of both states are stored. Where a state reaches back beyond its episode, the first observation repeats (report
+    transition has the id of its state's newest observation; it is available while it has a successor and all frames
+    of both states are stored. A state that reaches back beyond its episode repeats the first observation (report
     figure 2.3, `is_new`).
 
     Args:
@@ -91,7 +90,6 @@ class ReplayMemory:
         self._num_available = 0
 
     def __len__(self) -> int:
-        """Count the available transitions."""
         return self._num_available
 
     @property
@@ -115,11 +113,10 @@ class ReplayMemory:
         self._newest[env] = self.next_id - 1
 
     def add(self, env: int, action: int, reward: float, observation: npt.NDArray[np.uint8], terminal: bool) -> None:
-        """Append the step of environment `env` that led to `observation`; nothing after a terminal one counts for it.
+        """Append the step of environment `env` that led to `observation`.
 
         Raises:
-            ValueError: `env` has no episode under way, or all others together have appended more than 65,534
-                observations since its last one.
+            ValueError: `env` has no episode under way, or the others have appended more than 65,534 observations since.
         """
         if env not in self._newest:
             raise ValueError(f"environment {env} has no episode under way: begin one before adding steps")
@@ -130,11 +127,7 @@ class ReplayMemory:
         self._newest[env] = self.next_id - 1
 
     def draw(self, count: int, rng: np.random.Generator) -> npt.NDArray[np.int64]:
-        """Draw `count` ids uniformly, with replacement, from the available transitions.
-
-        Raises:
-            ValueError: no transition is available.
-        """
+        """Draw `count` available ids uniformly, with replacement. Raises: ValueError if there are none."""
         if not self._num_available:
             raise ValueError("replay holds no transition to draw")
         drawn = np.empty(0, np.int64)
@@ -155,24 +148,16 @@ class ReplayMemory:
         return previous[self.available(previous)]
 
     def rewards(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
-        """Return the rewards of transitions without decoding a frame.
-
-        Raises:
-            ValueError: one of `ids` is not available.
-        """
+        """Return the rewards of transitions without decoding a frame. Raises: ValueError if one is not available."""
         return self._reward[self._successors(ids) % self.capacity]
 
     def gather(self, ids: npt.NDArray[np.int64], returns: Returns) -> Transitions:
-        """Return whole transitions.
-
-        Raises:
-            ValueError: one of `ids` is not available.
-        """
+        """Return whole transitions. Raises: ValueError if one is not available."""
         first = last = self._successors(ids)
         r_t = returns.reward(self._reward[first % self.capacity])
         steps = np.ones(len(ids), np.int64)
         for _ in range(returns.n_step - 1):
-            forward = self._forward[last % self.capacity]  # 0 at the end of what is known of an episode
+            forward = self._forward[last % self.capacity]  # 0 at an episode's latest observation
             forward = np.where(self._terminal[last % self.capacity], 0, forward)
             last = last + forward
             reward = returns.reward(self._reward[last % self.capacity])
@@ -191,13 +176,7 @@ class ReplayMemory:
         )
 
     def segment(self, since: int) -> dict[str, Any]:
-        """Return what a checkpoint needs beyond the segments that reach up to id `since`.
-
-        Entries never change, so each needs to be written only once: `load_segments` puts the pieces together.
-
-        Raises:
-            ValueError: `since` lies in the future.
-        """
+        """Return the entries since id `since` for a checkpoint. Raises: ValueError if that lies in the future."""
         if since > self.next_id:
             raise ValueError(f"replay has {self.next_id:,} observations behind it, so none since {since:,}")
         first_id = max(since, self.oldest_id)
@@ -218,12 +197,12 @@ class ReplayMemory:
         }
 
     def load_segments(self, segments: Iterable[dict[str, Any]]) -> None:
-        """Become the memory that wrote `segments`, given oldest first; those wholly evicted since may be missing.
+        """Become the memory that wrote `segments`, given oldest first; those wholly evicted may be missing.
 
-        What is evicted depends only on the lengths of the entries, so appending them once more leaves the same memory.
+        Eviction depends on the lengths of the entries alone, so appending them again leaves the same memory.
 
         Raises:
-            ValueError: a segment is malformed, one is missing, or they do not fit; the memory is then of no use.
+            ValueError: a segment is malformed, missing or does not fit; the memory is then unusable.
         """
         self._clear(0, b"")
         oldest_id = 0
@@ -238,12 +217,10 @@ class ReplayMemory:
         self.check_valid()
 
     def load_newest(self, segments: Iterable[dict[str, Any]], next_id: int) -> None:
-        """Become the memory that wrote `segments`, without the observations of those before them.
-
-        Of no segment, an empty memory that goes on at `next_id`; its environments have no episode under way.
+        """Become the memory that wrote `segments`, without older observations; without any, go on at `next_id`.
 
         Raises:
-            ValueError: as `load_segments`, but for missing ones.
+            ValueError: as `load_segments`, but not for missing ones.
         """
         self._clear(next_id, b"")
         for segment in segments:
@@ -256,7 +233,6 @@ class ReplayMemory:
 
     @property
     def highest_action(self) -> int:
-        """Return the highest action of any step, 0 before there is one."""
         return int(self._action.max())
 
     def state_dict(self) -> dict[str, Any]:
@@ -264,19 +240,11 @@ class ReplayMemory:
         return self.segment(0)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Become the memory that returned `state`.
-
-        Raises:
-            ValueError: as `load_segments`.
-        """
+        """Become the memory that returned `state`. Raises: ValueError as `load_segments`."""
         self.load_segments([state])
 
     def check_valid(self) -> None:
-        """Derive anew from the entries what is otherwise kept up step by step, and compare.
-
-        Raises:
-            ValueError: an invariant does not hold.
-        """
+        """Derive the links and counts from the entries and compare. Raises: ValueError if an invariant fails."""
         ids = np.arange(self.oldest_id, self.next_id)
         slots = ids % self.capacity
         back = self._back[slots].astype(np.int64)

@@ -13,30 +13,30 @@ from atlantis_exp.replay.memory import ReplayMemory
 _MOST_ERROR = 1e30  # so that the sum of all priorities is finite
 _LEAST_ERROR = 1e-6  # added to every error, so that each transition may come again
 _MOST_PRIORITY = 2 * _MOST_ERROR
-_FOREIGN = "the sampler's priorities are not of this replay memory; resume=never keeps what is there and begins anew"
+_FOREIGN = "the sampler's priorities are not of this replay memory; resume=never keeps this run and begins anew"
 
 
 class Draw(NamedTuple):
-    """A batch's transitions, and what each counts in the loss where that is not the same for all."""
+    """A batch's transitions and their weights in the loss, None if all are equal."""
 
     ids: npt.NDArray[np.int64]  # (B,)
     weights: npt.NDArray[np.float32] | None  # (B,), at most 1
 
 
 class Sampler(Protocol):
-    """Chooses the transitions of a batch; whoever gets weights owes it the errors that the batch had."""
+    """Chooses the transitions of a batch; after a draw with weights it is told the batch's errors."""
 
     def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> Draw:
         """Draw `batch_size` of the available transitions; ValueError if there are none."""
 
     def feed_back(self, ids: npt.NDArray[np.int64], errors: npt.NDArray[np.float32]) -> None:
-        """Take note of how far the values of transitions were off their targets, both (B,)."""
+        """Note the absolute TD errors (B,) of transitions (B,)."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that a continuation needs besides the memory."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where the sampler stood that `state_dict` described."""
+        """Continue from a state that `state_dict` returned."""
 
 
 class _Stateless:
@@ -55,7 +55,6 @@ class UniformSampler(_Stateless):
     """Every available transition is as likely as any other."""
 
     def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> Draw:
-        """Draw `batch_size` transitions uniformly with replacement; ValueError if there are none."""
         return Draw(memory.draw(batch_size, rng), None)
 
 
@@ -70,7 +69,6 @@ class TopHalfSampler(_Stateless):
     oversample: Oversample
 
     def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> Draw:
-        """Draw `batch_size` transitions, chosen by the game's rewards alone; ValueError if there are none."""
         ids = memory.draw(self.oversample * batch_size, rng)
         return Draw(ids[np.argsort(-memory.rewards(ids), kind="stable")[:batch_size]], None)
 
@@ -78,26 +76,23 @@ class TopHalfSampler(_Stateless):
 class PrioritizedSampler:
     """A transition is as likely as its last error to the power `alpha` (Schaul et al. 2016, proportional).
 
-    Weights make up for that, by the power `beta` of the likelihood; the likeliest of a batch has the least, the least
-    likely 1. A new transition has the highest priority that any has had. Draws are stratified: one from each of
-    `batch_size` equal parts of the sum of all priorities.
-
-    In addition to the memory it takes 16 to 32 bytes for each observation that this may hold.
+    Weights correct for that by the power `beta`; the least likely transition of a batch has weight 1. A new transition
+    gets the highest priority so far. Draws are stratified: one from each of `batch_size` equal parts of the sum of all
+    priorities. Takes 16 to 32 bytes for each observation of the memory's capacity.
     """
 
     def __init__(self, alpha: Probability, beta: Probability) -> None:
         self.alpha = alpha
         self.beta = beta
         # A binary tree of sums: node n is the sum of 2n and 2n + 1, the leaves are the second half, one a slot of the
-        # memory's ring. A sum is always added up anew, so that the leaves alone decide on all bits.
+        # memory's ring. Sums are never updated by differences, so that the leaves alone determine all bits.
         self._tree = np.zeros(2)
         self._capacity = 0  # of the memory
         self._highest = 1.0  # priority
-        self._oldest_id = 0  # of the memory when it was last looked at
+        self._oldest_id = 0  # of the memory at the last draw
         self._next_id = 0
 
     def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> Draw:
-        """Draw `batch_size` transitions by priority; ValueError if there are none."""
         if not len(memory):
             raise ValueError("replay holds no transition to draw")
         self._look_at(memory)
@@ -113,14 +108,12 @@ class PrioritizedSampler:
         return Draw(ids, ((priorities.min() / priorities) ** self.beta).astype(np.float32))
 
     def feed_back(self, ids: npt.NDArray[np.int64], errors: npt.NDArray[np.float32]) -> None:
-        """Give transitions that were drawn the priorities of their errors."""
-        # A priority that is no number, or a sum that is infinite, would make `_find` loop forever.
+        # A priority that is NaN, or an infinite sum, would make `_find` loop forever.
         priorities = (np.nan_to_num(errors.astype(np.float64), posinf=_MOST_ERROR) + _LEAST_ERROR) ** self.alpha
         self._set(ids % self._capacity, priorities)
         self._highest = max(self._highest, float(priorities.max()))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that a continuation needs besides the memory: 8 bytes for each observation that this may hold."""
         return {
             "priorities": self._leaves,
             "highest": self._highest,
@@ -129,10 +122,10 @@ class PrioritizedSampler:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where the sampler stood that `state_dict` described. Raises: ValueError."""
+        """Continue from a state that `state_dict` returned. Raises: ValueError."""
         priorities, highest = state["priorities"], float(state["highest"])
         if priorities.dtype != np.float64 or not np.all((priorities >= 0) & (priorities <= _MOST_PRIORITY)):
-            raise ValueError("the sampler's priorities are not numbers from 0 up")
+            raise ValueError("the sampler's priorities are not finite numbers from 0 up")
         if not 0 < highest <= _MOST_PRIORITY:
             raise ValueError(f"the sampler's highest priority is {highest}")
         self._plant(priorities)
@@ -149,7 +142,7 @@ class PrioritizedSampler:
         self._set(np.arange(self._capacity), priorities)
 
     def _look_at(self, memory: ReplayMemory) -> None:
-        """Forget what the memory has forgotten, and take in what is new."""
+        """Drop transitions that the memory has dropped, and add the new ones."""
         if not self._next_id:
             self._plant(np.zeros(memory.capacity))
         if self._capacity != memory.capacity or not 0 <= self._oldest_id <= self._next_id <= memory.next_id:
@@ -168,7 +161,7 @@ class PrioritizedSampler:
             self._tree[nodes] = self._tree[2 * nodes] + self._tree[2 * nodes + 1]
 
     def _find(self, shares: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-        """Return the slots that lie at these shares, in [0, 1), of the sum of all priorities."""
+        """Return the slots at these shares, in [0, 1), of the sum of all priorities."""
         if not self._tree[1] > 0:  # nothing would ever be found
             raise Fault(_FOREIGN)
         rest = shares * self._tree[1]

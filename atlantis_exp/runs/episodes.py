@@ -17,7 +17,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EpisodeTable:
-    """Evaluated episodes, one row each."""
+    """Columns of evaluated episodes."""
 
     actions: tuple[str, ...]
     seeds: npt.NDArray[np.int64]  # (episodes,), of the emulators
@@ -27,7 +27,7 @@ class EpisodeTable:
     truncated: Array  # (episodes,), 1 where the time cap ended it
     counts: Array  # steps, (episodes, actions, 2): chosen by the network, by chance
     points: Array  # (episodes, sources), the scores' parts; NaN where an older version did not record them
-    sources: tuple[str, ...]  # what pays points
+    sources: tuple[str, ...]  # of points
 
     def to_csv(self) -> str:
         """Return the table with a header: steps by action, those that chance chose, and points by source."""
@@ -44,7 +44,7 @@ class EpisodeTable:
 
     @classmethod
     def read(cls, path: Path, sources: Sequence[str] = ()) -> Self:
-        """Read a file's table, and of its points those of these sources. Raises: ValueError, OSError."""
+        """Read a file's table with the points of these sources. Raises: ValueError, OSError."""
         try:
             header, *lines = csv.reader(io.StringIO(read_file(path, SMALL).decode(), newline=""), strict=True)
             rows = [dict(zip(header, line, strict=True)) for line in lines]

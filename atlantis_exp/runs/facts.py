@@ -1,30 +1,25 @@
-"""What a journal says of its run apart from the points of its curves: tags and files."""
+"""Read a journal's tags and files without its curves."""
 
 import mmap
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from atlantis_exp.runs.files import open_file
 from atlantis_exp.runs.journal import Artifact, Record, Tags, read, read_commit
 
 
-@dataclass(frozen=True)
-class Facts:
-    """What is committed: each tag's last value, and the names of files under `artifacts/`, each once, in order."""
+class JournalFacts(NamedTuple):
+    """The last value of each tag, and the names of the files under `artifacts/`, as of the last commit."""
 
     tags: dict[str, str]
-    artifacts: tuple[str, ...]
+    artifacts: tuple[str, ...]  # each once, in order
 
 
-def read_facts(folder: Path) -> Facts:
-    """Read a run folder's tags and the names of its files.
-
-    Raises:
-        OSError, ValueError: on a journal that ends before its commit, or a line that no writer left so.
-    """
+def read_facts(folder: Path) -> JournalFacts:
+    """Read a run folder's tags and the names of its files. Raises: OSError, ValueError for a damaged journal."""
     paths = (record.path for record in _records(folder, "artifact") if isinstance(record, Artifact))
-    return Facts(read_tags(folder), tuple(dict.fromkeys(paths)))
+    return JournalFacts(read_tags(folder), tuple(dict.fromkeys(paths)))
 
 
 def read_tags(folder: Path) -> dict[str, str]:
@@ -37,7 +32,7 @@ def read_tags(folder: Path) -> dict[str, str]:
 
 
 def _records(folder: Path, kind: str) -> Iterator[Record]:
-    """The committed records of a kind; other lines are passed over, however many there are."""
+    """Yield the committed records of a kind; parse no other line."""
     commit = read_commit(folder)
     if commit is None or commit.offset == 0:
         return
@@ -50,7 +45,7 @@ def _records(folder: Path, kind: str) -> Iterator[Record]:
 
 
 def _lines(journal: mmap.mmap, opening: bytes, end: int) -> Iterator[int]:
-    """Where the lines with such an opening begin."""
+    """Yield the offsets of the lines that start with `opening`."""
     if journal[: len(opening)] == opening:
         yield 0
     newline = journal.find(b"\n" + opening, 0, end)

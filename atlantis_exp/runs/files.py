@@ -1,6 +1,6 @@
-"""Write files of run folders whole, and read them within bounds, since they may come from anybody.
+"""Write files of run folders whole, and read them within bounds: they may come from anybody.
 
-No symbolic link is followed, and no hard link written through: both lead to files of another folder.
+No symbolic link is followed and no hard link written through, since both lead to another folder's files.
 """
 
 import errno
@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 Natural = Annotated[int, Field(ge=0, lt=2**63)]
 
-SMALL = 2**24  # bytes; what a run says of itself has some kilobytes, a table of 20,000 episodes two megabytes
+SMALL = 2**24  # bytes; a table of 20,000 episodes has 2 MB, other texts of a run a few KB
 ARTIFACT = 2**30  # bytes, of a film or a network
 CHECKPOINT = 2**36  # bytes, of a whole replay memory
 
@@ -28,7 +28,7 @@ _schemas: dict[Any, TypeAdapter[Any]] = {}
 
 
 def schema_of(kind: type[T]) -> TypeAdapter[T]:
-    """Return what checks and makes instances of a class; making all at import would take a tenth of a second."""
+    """Return the pydantic schema of a class, made on first use: all at import would take 0.1 s."""
     if kind not in _schemas:
         _schemas[kind] = TypeAdapter(kind)
     return _schemas[kind]
@@ -49,11 +49,11 @@ def open_file(path: Path) -> BinaryIO:
         file = open(path, "rb", opener=no_link)  # noqa: SIM115
     except OSError as error:
         if error.errno == errno.ELOOP:
-            raise ValueError(f"{path} is no regular file, but a link") from None
+            raise ValueError(f"{path} is not a regular file, but a link") from None
         raise
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
-        raise ValueError(f"{path} is no regular file")
+        raise ValueError(f"{path} is not a regular file")
     return file
 
 
@@ -66,10 +66,7 @@ def read_file(path: Path, most: int) -> bytes:
 
 
 def no_link(path: str, flags: int) -> int:
-    """Open a file, but not a symbolic link, as `opener` of `open`; a hard link is cut before it is written.
-
-    A pipe does not block, as it otherwise would until its other end is opened. Raises: OSError.
-    """
+    """Open a file as `opener` of `open`: no symbolic link, hard links cut before writing, pipes not blocking."""
     if flags & (os.O_WRONLY | os.O_RDWR):
         own(Path(path))
     return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
@@ -87,7 +84,7 @@ def own(path: Path) -> None:
 
 
 def inside(folder: Path, path: str) -> Path:
-    """Return the file in a run's folder that a path names. Raises: ValueError if it, or a link, leads out of it."""
+    """Return the file in a run's folder that a path names. Raises: ValueError if it leads out of the folder."""
     root = folder.parent.resolve() / folder.name
     file = (root / path).resolve()
     if root not in file.parents:
@@ -96,13 +93,13 @@ def inside(folder: Path, path: str) -> Path:
 
 
 def is_whole(content: bytes, sha256: str) -> bool:
-    """Tell whether a content has a checksum; an empty one, as 0.1.0 left it, fits any content."""
+    """Tell whether a content has a checksum; an empty one, as 0.1.0 wrote it, fits any content."""
     return sha256 in ("", hashlib.sha256(content).hexdigest())
 
 
 def read_object(content: bytes) -> dict[str, Any]:
-    """Return the object that JSON of bounded depth holds. Raises: ValueError."""
-    tree = from_json(content)  # has a bound of its own, where `json` ends in RecursionError
+    """Return the object that JSON holds. Raises: ValueError, also for JSON that is nested too deep."""
+    tree = from_json(content)  # bounds the depth; `json` would raise RecursionError
     if not isinstance(tree, dict):
         raise ValueError(f"should be an object, is {type(tree).__name__}")
     return tree
@@ -130,10 +127,7 @@ def write_file(path: Path, content: bytes) -> None:
 
 @contextmanager
 def whole(folder: Path) -> Iterator[Path]:
-    """Yield a folder to fill, which takes the place of `folder` when the block ends well and is removed otherwise.
-
-    Raises: OSError if it cannot be made, or `folder` is there and not empty.
-    """
+    """Yield a folder to fill that becomes `folder` if the block ends well. Raises: OSError."""
     aside = folder.with_name(folder.name + ".aside")
     shutil.rmtree(aside, ignore_errors=True)
     make_folder(aside)

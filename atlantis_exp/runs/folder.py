@@ -1,4 +1,4 @@
-"""Run folders: where a run lives, what its files are called, who holds it, and how it ended."""
+"""Run folders: their places, files, holders and results."""
 
 import json
 import os
@@ -39,7 +39,7 @@ T = TypeVar("T")
 
 
 def evaluation_at(step: int) -> str:
-    """The artifact with the episodes of a training's evaluation at a step."""
+    """Return the name of the artifact with the episodes of a training's evaluation at a step."""
     return f"evaluation/{step:09d}.csv"
 
 
@@ -61,16 +61,13 @@ class Result:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """One run's folder: `config.json` at its start, `result.json` at its end, journal and checkpoints in between.
-
-    Reading a file of it that is damaged raises Fault.
-    """
+    """One run's folder: `config.json` at its start, `result.json` at its end; a damaged file raises Fault."""
 
     path: Path
 
     @classmethod
     def of(cls, config: Config) -> Self:
-        """The folder of the training that a config is."""
+        """Return the folder of a config's training."""
         return cls(Path(config.paths.outputs) / "runs" / config.run_name())
 
     @property
@@ -80,11 +77,10 @@ class RunFolder:
 
     @property
     def checkpoints(self) -> Path:
-        """The folder of the training's checkpoints."""
         return self.path / CHECKPOINTS
 
     def artifact(self, name: str) -> Path:
-        """A file that the journal names. Raises: ValueError where it leads out of the folder."""
+        """Return a file that the journal names. Raises: ValueError if it leads out of the folder."""
         return inside(self.path / "artifacts", name)
 
     @property
@@ -112,35 +108,35 @@ class RunFolder:
 
     @property
     def final_result(self) -> Result | None:
-        """How the run ended; None also while it is being made longer, when `result` is of its end before."""
+        """How the run ended; None also while it is made longer, when `result` is an earlier end."""
         return self.result if self.state == "done" else None
 
     def ended(self, budget: int | None) -> Result | None:
-        """How the run has ended, None if it goes on: it has not, or did by its budget of steps and has now a larger."""
+        """Return the result of an ended run, None if it can go on, as after its budget of steps was raised."""
         if not self.has_started or (result := self.result) is None:
             return None
         return None if result.outcome == "budget" and (budget is None or budget > result.steps) else result
 
     def put_aside(self) -> Path:
-        """Renames the folder, for a new run to have its place; returns where it is now. Raises: Fault while held."""
+        """Rename the folder to make room for a new run; return its new place. Raises: Fault while held."""
         kept = next(path for n in range(1, 10_000) if not (path := self.path.with_name(f"{self.name}~{n}")).exists())
         with self.held():
             return self.path.rename(kept)
 
     @property
     def has_lost_checkpoints(self) -> bool:
-        """Whether there was a commit and there is no checkpoint, as in a folder that was brought without them."""
+        """Whether the run has committed but its checkpoints are missing, as in a copy without them."""
         commit = self.commit
         was_committed = (commit is not None and commit.offset > 0) or has_lost_commit(self.path)
         return was_committed and not any(self.checkpoints.glob("*/manifest.json"))
 
     @property
     def commit(self) -> Commit | None:
-        """What the run's writer last committed, None before its first commit or status."""
+        """The last commit, None before the first commit or status."""
         return read_commit(self.path)
 
     def records(self) -> Iterator[Record]:
-        """What the run's journal holds, as of its last commit. Raises: Fault, where it is damaged."""
+        """Yield the committed records of the journal. Raises: Fault if it is damaged."""
         try:
             for _, record in read(self.path):
                 yield record
@@ -149,17 +145,15 @@ class RunFolder:
 
     @property
     def title(self) -> str:
-        """What people call the run."""
         return commit.labels.get("mlflow.runName", self.name) if (commit := self.commit) else self.name
 
     @property
     def status(self) -> Status | None:
-        """What the run last said of itself, None before it said anything."""
+        """The last status written, None before the first."""
         return commit.status if (commit := self.commit) else None
 
     @property
     def error(self) -> str:
-        """Why the run failed, empty if it did not."""
         return commit.error if (commit := self.commit) else ""
 
     @property
@@ -169,53 +163,50 @@ class RunFolder:
 
     @property
     def state(self) -> State:
-        """How far the run is; one whose process was killed is interrupted, whatever its journal says."""
+        """The run's state; a run whose process was killed is interrupted, whatever its journal says."""
         if not self.has_started:
             return "failed" if self.status == "FAILED" else "queued"
         status = self.status
         if status == "FAILED":
             return "failed"
-        if self.result is not None and status not in ("RUNNING", "KILLED"):  # which a run is that was made longer
+        if self.result is not None and status not in ("RUNNING", "KILLED"):  # as a run is that is made longer
             return "done"
         has_ended = status not in (None, "SCHEDULED", "RUNNING")
         return "running" if not has_ended and self.is_held else "interrupted"
 
     @property
     def is_held(self) -> bool:
-        """Whether a process holds the run."""
         return lock.is_held(self.path)
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Hold the run against other processes. Raises: Fault, naming the one that holds it."""
+        """Hold the run against other processes. Raises: Fault naming the process that holds it."""
         with lock.held(self.path, f"run {self.name}", _HOLD_SECONDS):
             yield
 
     def write_config(self, config: Mapping[str, Any]) -> None:
-        """Keep the composed config."""
         write_file(self.path / CONFIG, json.dumps(config, indent=2).encode())
 
     def write_result(self, result: Result) -> None:
-        """Keep how the run ended."""
         write_file(self.path / RESULT, json.dumps(asdict(result), indent=2).encode())
 
 
 def all_folders(outputs: Path) -> list[RunFolder]:
-    """All folders under `outputs` with a journal, be they of runs, sweeps, searches, evaluations or comparisons."""
+    """Return all folders under `outputs` with a journal: runs, sweeps, searches, evaluations, comparisons."""
     return [RunFolder(path.parent) for path in sorted(outputs.glob(f"*/*/{COMMIT}"))]
 
 
 def all_runs(outputs: Path) -> list[RunFolder]:
-    """All runs that have started, by name."""
+    """Return all runs that have started, by name."""
     return [RunFolder(path.parent) for path in sorted((outputs / "runs").glob(f"*/{CONFIG}"))]
 
 
 def find_run(outputs: Path, name: str) -> RunFolder:
-    """The training run of that name, that start of a name, or the latest.
+    """Return the training run with a name, with a unique start of a name, or the latest.
 
     Raises:
-        ConfigError: where it is none or not the only one.
-        Fault: where it is damaged.
+        ConfigError: no run or several match.
+        Fault: it is damaged.
     """
 
     def is_training(folder: RunFolder) -> bool:
@@ -228,7 +219,7 @@ def find_run(outputs: Path, name: str) -> RunFolder:
 
     folders = [folder for folder in all_runs(outputs) if is_training(folder)]
     if not folders:
-        raise ConfigError(f"run={name}: there is no training run under {outputs / 'runs'}")
+        raise ConfigError(f"run={name}: {outputs / 'runs'} has no training runs")
     if name == "latest":
         return max(folders, key=lambda folder: (folder.path / CONFIG).stat().st_mtime)
     matching = [folder for folder in folders if folder.name == name] or [
@@ -245,4 +236,4 @@ def _read(path: Path, kind: type[T]) -> T | None:
     try:
         return schema_of(kind).validate_json(read_file(path, SMALL), strict=True) if path.exists() else None
     except ValueError:
-        raise Fault(f"{path} is damaged: remove it and issue the run's command again, which writes it anew") from None
+        raise Fault(f"{path} is damaged: remove it and repeat the run's command, which writes it anew") from None

@@ -18,8 +18,6 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal, get_args
 from uuid import uuid4
 
-from pydantic import ValidationError
-
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import (
     SMALL,
@@ -51,14 +49,14 @@ class Metrics:
 
 @dataclass(frozen=True)
 class Params:
-    """What the run was asked to do."""
+    """The settings of the run."""
 
     values: dict[str, str]
 
 
 @dataclass(frozen=True)
 class Tags:
-    """What is said about the run; a later value replaces an earlier one."""
+    """Facts about the run; a later value replaces an earlier one."""
 
     values: dict[str, str]
 
@@ -122,17 +120,17 @@ class JournalError(Fault, ValueError):
     """A journal that cannot be continued from."""
 
 
-_POINT_BYTES = 2_000  # between two points of a curve that are worth reading; three lines of a journal, or so
+_POINT_BYTES = 2_000  # between two points that `curve` reads; about three lines of a journal
 
 
 class Tracker:
-    """What training may tell about itself; this one forgets everything."""
+    """The null object of tracking: takes all that a training records, and forgets it."""
 
     def metrics(self, values: Mapping[str, float], step: int) -> None:
         """Record values measured at a step."""
 
     def params(self, values: Mapping[str, str]) -> None:
-        """Record what the run was asked to do."""
+        """Record the settings of the run."""
 
     def tags(self, values: Mapping[str, str]) -> None:
         """Record facts about the run."""
@@ -150,10 +148,10 @@ class Tracker:
         """Keep weights (safetensors) of a step and the metrics that they reached; `best` of all of the name so far."""
 
     def status(self, status: Status, error: str = "") -> None:
-        """Say what state the run is in and why it failed, and reveal nothing else."""
+        """Make the run's state visible, and the reason of a failure, but no records."""
 
     def commit(self) -> None:
-        """Reveal all that the latest state holds; to be called once a checkpoint holding it is durable."""
+        """Make all records of the latest state visible; call it once a checkpoint with that state is durable."""
 
     def state_dict(self) -> dict[str, Any]:
         """Make all records durable and return where they end."""
@@ -166,22 +164,21 @@ class Tracker:
 class Journal(Tracker):
     """A tracker that writes a run folder, which has one writer at a time.
 
-    Without `load_state_dict` it begins an empty journal, even in a folder that holds one. Names of metrics, params,
-    tags, images and models are checked against MLflow's alphabet, so that publishing cannot stumble over them later.
+    Without `load_state_dict` it begins an empty journal, even in a folder that holds one. Names are checked against
+    MLflow's alphabet.
 
     Raises:
-        JournalError: on a folder whose `commit.json` is damaged; from `state_dict` where the journal was cut or
-            replaced since; from `load_state_dict` also where a line of it is no record.
-        ValueError: on a name that MLflow would refuse, or a path that leads out of `artifacts/`.
-        OSError: from `state_dict` when the disk refuses; what was durable stays so, and a later call writes the rest.
+        JournalError: `commit.json` or a line is damaged, or the journal was cut or replaced meanwhile.
+        ValueError: MLflow would refuse a name, or a path leads out of `artifacts/`.
+        OSError: the disk refuses; durable lines stay so, and a later `state_dict` writes the rest.
     """
 
     def __init__(self, folder: Path, labels: Mapping[str, str] | None = None) -> None:
         make_folder(folder)
         self._folder = folder
         self._time = _now()  # ms, of the latest metrics
-        self._offset = 0  # bytes that are durable and that the state speaks for
-        self._lines: list[bytes] = []  # after the last checkpoint: would be redone, so memory suffices
+        self._offset = 0  # bytes that are durable and in the state
+        self._lines: list[bytes] = []  # since the last checkpoint: a resumed run redoes them, so memory suffices
         commit = read_commit(folder) or _unborn()
         if commit.status == "SCHEDULED":
             commit = replace(commit, started=self._time, status="RUNNING")
@@ -189,14 +186,14 @@ class Journal(Tracker):
         self._commit = replace(commit, labels={**commit.labels, **named})
 
     def resume(self) -> bool:
-        """Go on after the last commit, as a writer without checkpoints does; return whether there is one."""
+        """Continue after the last commit, for a writer without checkpoints; return whether there is one."""
         if not self._commit.offset:
             return False
         self.load_state_dict({"offset": self._commit.offset, "time": self._commit.updated})
         return True
 
     def recover(self) -> None:
-        """Make all whole lines count again, for an ended run whose `commit.json` was removed."""
+        """Commit all whole lines again, for an ended run whose `commit.json` was removed."""
         with open_file(self._folder / "journal.jsonl") as file:
             self._offset = sum(len(line) for line in iter(partial(file.readline, SMALL), b"") if line.endswith(b"\n"))
         self.commit()
@@ -204,36 +201,32 @@ class Journal(Tracker):
 
     def metrics(self, values: Mapping[str, float], step: int) -> None:
         self._time = max(self._time, _now())
-        self._append(Metrics(step, self._time, {_name(key): float(value) for key, value in values.items()}))
+        self._append(Metrics(step, self._time, _numbers(values)))
 
     def params(self, values: Mapping[str, str]) -> None:
-        self._append(Params({_name(key): value for key, value in values.items()}))
+        self._append(Params(_named(values)))
 
     def tags(self, values: Mapping[str, str]) -> None:
-        self._append(Tags({_name(key): value for key, value in values.items()}))
+        self._append(Tags(_named(values)))
 
     def note(self, markdown: str) -> None:
         self.tags({NOTE: markdown})
 
     def artifact(self, path: str, content: bytes) -> None:
-        write_file(inside(self._folder / "artifacts", path), content)
-        self._append(Artifact(path, hashlib.sha256(content).hexdigest()))
+        self._append(Artifact(path, self._write(path, content)))
 
     def image(self, key: str, content: bytes, step: int) -> None:
         path = f"images/{_name(key)}/{step}.png"
-        write_file(inside(self._folder / "artifacts", path), content)
+        self._write(path, content)
         self._append(Image(key, step, self._time, path))
 
     def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None:
         if set("/.") & set(name):
             raise ValueError(f"A model's name holds neither '/' nor '.': {name!r}")
         path = model_file(_name(name), step)
-        write_file(inside(self._folder / "artifacts", path), content)
-        digest = hashlib.sha256(content).hexdigest()
-        # MLflow charts a model's metrics on the run as well: with the time of the metrics just recorded they are the
-        # same points, not second ones.
-        values = {_name(key): float(value) for key, value in metrics.items()}
-        self._append(Model(name, step, self._time, path, values, best, digest))
+        digest = self._write(path, content)
+        # MLflow charts a model's metrics on the run, too: at the time of the metrics just recorded they coincide.
+        self._append(Model(name, step, self._time, path, _numbers(metrics), best, digest))
 
     def status(self, status: Status, error: str = "") -> None:
         self._mark(replace(self._commit, status=status, error=error))
@@ -247,7 +240,7 @@ class Journal(Tracker):
         self.commit()
 
     def finish(self) -> None:
-        """Make all records durable and visible, and say that there will be no more."""
+        """Make all records durable and visible, and mark the run as finished."""
         self.flush()
         self.status("FINISHED")
 
@@ -267,71 +260,55 @@ class Journal(Tracker):
                 raise ValueError(f"{path} is shorter than the checkpoint says: it was cut or replaced since")
             deque(read(self._folder, end=state["offset"]), maxlen=0)
         except ValueError as error:
-            advice = "restore it, or begin anew with resume=never, which keeps what is there"
+            advice = "restore it, or begin anew with resume=never, which keeps the old run"
             raise JournalError(f"{error}; {advice}") from None
         self._offset, self._time = state["offset"], state["time"]
         self._lines.clear()
+
+    def _write(self, path: str, content: bytes) -> str:
+        """Write an artifact; return its SHA-256."""
+        write_file(inside(self._folder / "artifacts", path), content)
+        return hashlib.sha256(content).hexdigest()
 
     def _append(self, record: Record) -> None:
         line = _encode({"kind": type(record).__name__.lower(), **vars(record)})
         self._lines.append(line.encode() + b"\n")
 
     def _mark(self, commit: Commit) -> None:
-        # What was visible cannot be unsent: a journal that goes back behind its commit is a new run to its readers.
+        # Sent records cannot be taken back: a journal that goes back behind its commit is a new run to its readers.
         identity = self._commit.identity if commit.offset >= self._commit.offset else uuid4().hex
-        # Whatever a clock that was set back says: no run ends before it began.
+        # A clock may have been set back: no run ends before it began.
         self._commit = replace(commit, identity=identity, updated=max(_now(), self._time, self._commit.updated))
         _write_commit(self._folder, self._commit)
 
 
 def read_commit(folder: Path) -> Commit | None:
-    """Return what the run folder's writer last committed, None before its first commit or status.
-
-    Raises:
-        JournalError: on a file that no writer left so; without it the whole journal is a new run to its readers.
-    """
+    """Return a run folder's last commit, None before its first commit or status. Raises: JournalError."""
     path = folder / "commit.json"
     try:
-        return commit_of(read_file(path, SMALL)) if path.exists() else None
+        return schema_of(Commit).validate_json(read_file(path, SMALL), strict=True) if path.exists() else None
     except ValueError:
-        raise JournalError(f"{path} is damaged: remove it and issue the run's command again") from None
+        raise JournalError(f"{path} is damaged: remove it and repeat the run's command") from None
 
 
 def has_lost_commit(folder: Path) -> bool:
-    """Tell whether a run folder's journal holds something that once counted, but `commit.json` is gone.
-
-    Raises:
-        JournalError: on a folder whose `commit.json` is damaged.
-    """
+    """Tell whether a run folder has a journal but has lost its `commit.json`. Raises: JournalError if it is damaged."""
     commit, path = read_commit(folder), folder / "journal.jsonl"
     is_new = commit is None or (commit.status == "SCHEDULED" and not commit.offset)  # as a sweep makes it anew
     return is_new and path.exists() and path.stat().st_size > 0
 
 
-def commit_of(content: bytes) -> Commit:
-    """Return the commit in the bytes of a `commit.json`. Raises: JournalError."""
-    try:
-        return schema_of(Commit).validate_json(content, strict=True)
-    except ValidationError:
-        raise JournalError("this is no commit.json") from None
-
-
 def commit_bytes(commit: Commit) -> bytes:
-    """Return the bytes of a commit's `commit.json`."""
     return _encode(asdict(commit)).encode()
 
 
 def model_file(name: str, step: int) -> str:
-    """Return the artifact's name of a model's weights at a step."""
+    """Return the name of the artifact with a model's weights at a step."""
     return f"models/{name}/{step}.safetensors"
 
 
 def adopt(folder: Path, parent: Path) -> None:
-    """Put a run, which may have yet to start, under another one; nobody may be writing its folder.
-
-    Raises:
-        JournalError: on a folder whose `commit.json` is damaged.
-    """
+    """Put a run, started or not, under another one; nobody may be writing its folder. Raises: JournalError."""
     make_folder(folder)
     commit = read_commit(folder) or _unborn()
     adopted = replace(commit, parent=os.path.relpath(parent, folder))
@@ -340,7 +317,7 @@ def adopt(folder: Path, parent: Path) -> None:
 
 
 def _write_from(folder: Path, start: int, content: bytes) -> None:
-    """Replace all after an offset of a journal by other bytes, durably. Raises: JournalError, OSError."""
+    """Replace the journal after an offset, durably. Raises: JournalError, OSError."""
     with open(folder / "journal.jsonl", "ab", opener=no_link) as file:
         if os.fstat(file.fileno()).st_size < start:  # truncating would fill the gap with zeros
             raise JournalError(f"{file.name} is shorter than its writer left it: it was cut or replaced since")
@@ -351,14 +328,10 @@ def _write_from(folder: Path, start: int, content: bytes) -> None:
 
 
 def read(folder: Path, start: int = 0, end: int | None = None) -> Iterator[tuple[int, Record]]:
-    """Yield the committed records between two offsets, each with the offset where it ends.
-
-    Args:
-        start: bytes; where a record begins.
-        end: bytes; None means the last commit.
+    """Yield the records between two offsets in bytes, by default up to the last commit, each with its end.
 
     Raises:
-        ValueError: on a journal that ends before `end`, a line that is no record, or a path out of `artifacts/`.
+        ValueError: the journal ends before `end`, a line is not a record, or a path leads out of `artifacts/`.
     """
     if end is None:
         commit = read_commit(folder)
@@ -386,10 +359,10 @@ def record_of(line: bytes, where: str) -> Record:
 
 
 def curve(folder: Path, keys: Sequence[str], points: int = 500) -> Iterator[Metrics]:
-    """Yield the committed metrics that hold all of some keys, of a long journal about `points` of them.
+    """Yield the committed metrics that hold all of some keys; about `points` of a long journal, in constant time.
 
-    A journal of over 2,000 bytes a point is cut into as many stretches of equal length, and the first in each is taken;
-    the first and the last of all are always among them. So a history's length costs nothing.
+    A journal of over 2,000 bytes a point is cut into stretches of equal length. The first point of each is taken, and
+    the last of all.
 
     Raises:
         ValueError: as `read`.
@@ -435,6 +408,14 @@ def _line(file: BinaryIO, start: int, end: int) -> bytes:
     if len(line) == SMALL:
         raise ValueError(f"{file.name} has a line of more than {SMALL:,} bytes at byte {start}")
     raise ValueError(f"{file.name} ends at byte {start + len(line)}, before its commit at {end}")
+
+
+def _named(values: Mapping[str, str]) -> dict[str, str]:
+    return {_name(key): value for key, value in values.items()}
+
+
+def _numbers(values: Mapping[str, float]) -> dict[str, float]:
+    return {_name(key): float(value) for key, value in values.items()}
 
 
 def _unborn() -> Commit:

@@ -20,11 +20,10 @@ def held(folder: Path, name: str, seconds: float) -> Iterator[None]:
     """Hold a folder, made if need be, for the block; wait up to so many seconds for it.
 
     Raises:
-        Fault: naming the process that holds it, exit code 75; or a symbolic link, through which another file would be
-            written.
+        Fault: another process holds it (exit code 75), or it contains a symbolic link.
     """
     if (link := _link(folder)) is not None:
-        raise Fault(f"{name}: {link} is a link, which is not written through; put what it leads to in its place")
+        raise Fault(f"{name}: {link} is a link, which is not written through; replace it by a copy of its target")
     make_folder(folder)
     try:
         lock = FileLock(folder / "lock").acquire(seconds)

@@ -1,4 +1,4 @@
-"""What made a run: versions of code and libraries, and the command."""
+"""The origin of a run: versions of code and libraries, and the command."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ _LIBRARIES = ("atlantis-exp", "ale-py", "gymnasium", "torch", "numpy", "opencv-p
 
 
 def provenance(command: str) -> dict[str, str]:
-    """What made a run, as tags."""
+    """Return the tags that say which code, libraries and command make a run."""
     tags = {f"version.{name}": version(name) for name in _LIBRARIES}
     tags["version.python"] = sys.version.split()[0]
     checkout = Path(__file__).resolve().parents[2]
@@ -20,7 +20,7 @@ def provenance(command: str) -> dict[str, str]:
             done = subprocess.run(("git", *arguments), cwd=checkout, capture_output=True, text=True, check=True)
             return done.stdout.strip()
 
-        with suppress(OSError, subprocess.CalledProcessError):  # there is no git, or it refuses somebody else's folder
+        with suppress(OSError, subprocess.CalledProcessError):  # git is missing, or refuses another user's folder
             commit = git("rev-parse", "HEAD")
             dirty = str(bool(git("status", "--porcelain", "--untracked-files=no"))).lower()
             tags |= {"git.commit": commit, "git.dirty": dirty}

@@ -1,5 +1,5 @@
-"""What is done with runs: trained, swept, searched, evaluated, exported, verified, sent and shown.
+"""The work on runs: train, sweep, search, evaluate, compare, export, verify, publish, show.
 
-In: a checked config and what was asked for, as a `Job`. Out: run folders, lines for a person, an exit code. It knows
-no Hydra and no command line: what was typed arrives as values.
+In: a checked config and the user's wishes, as a `Job`. Out: run folders, lines for a person, an exit code. It knows no
+Hydra and no command line: typed words arrive as values.
 """

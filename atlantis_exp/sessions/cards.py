@@ -1,4 +1,4 @@
-"""Exported weights: a folder with the network's weights, a card that says what they are, and a page for people."""
+"""Exported weights: a folder with the network's weights, their card, and a page for people."""
 
 import hashlib
 import json
@@ -23,7 +23,7 @@ from atlantis_exp.statistics import interval, resample, summarize
 from atlantis_exp.training.actor import Actor
 from atlantis_exp.training.evaluation import Evaluation
 
-SINGLE = 8_000_000  # bytes; larger weights are handed on in half precision, since they often lie in a repository
+SINGLE = 8_000_000  # bytes; larger weights are written in half precision, to keep repositories small
 
 _COLUMNS = ("mean", "95 % interval", "median", "IQM", "high", "low", "episodes", "epsilon", "seed")
 _RESAMPLES = 10_000  # bootstrap samples
@@ -32,14 +32,14 @@ _RESAMPLED = 10_000  # episodes at most
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class Card:
-    """Which training exported weights are of, and what they score."""
+    """The training of exported weights, and their scores."""
 
     format: Literal[1]
     run: str
     weights: Literal["latest", "best"]
     step: Annotated[int, Field(ge=0)]  # of the training
     reached: dict[str, float]  # episodes, frames, updates and hours, at the last point of the curve until then
-    made: dict[str, str]  # command, precision, commit and versions of the training's last session
+    made: dict[str, str]  # command, precision, commit and versions of the last session
     precision: Literal["float32", "float16"]
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]  # of weights.safetensors
     config: Config
@@ -51,15 +51,13 @@ def read_card(folder: Path) -> tuple[Card, bytes]:
     """Read a folder's card, and its weights as safetensors.
 
     Raises:
-        ConfigError: no such folder, or not a card in it.
+        ConfigError: the folder or its card is missing or damaged.
         Fault: the weights are not the card's.
     """
-    path = folder / "card.json"  # may be a link, as in a cache of downloads: somebody named this very folder
+    path = folder / "card.json"  # may be a link, as in a cache of downloads: a person named this folder
     if not path.exists():
-        others = {str(card.parent) for card in folder.parent.glob("*/card.json")}
-        raise ConfigError(
-            f"weights={folder}: no folder with a card.json; {nearest(str(folder), {'latest', 'best'} | others)}"
-        )
+        choices = {"latest", "best", *(str(card.parent) for card in folder.parent.glob("*/card.json"))}
+        raise ConfigError(f"weights={folder}: not a folder with a card.json; {nearest(str(folder), choices)}")
     try:
         card = parse(Card, read_object(read_file(path.resolve(), SMALL)))
     except (OSError, ValueError) as error:
@@ -76,10 +74,7 @@ def read_card(folder: Path) -> tuple[Card, bytes]:
 def write_card(
     folder: Path, shown: Path, card: Card, weights: bytes, evaluation: Evaluation, onnx: bytes | None = None
 ) -> None:
-    """Fill a folder, which people will find as `shown`, with weights, their card, and a page for people and model hubs.
-
-    Raises: OSError.
-    """
+    """Write weights, their card, and a page for people and model hubs into a folder, called `shown` on the page."""
     write_file(folder / "weights.safetensors", weights)
     files = f"`weights.safetensors`: {len(weights):,} bytes, {card.precision}, sha256 `{card.sha256}`."
     if onnx is not None:
@@ -103,7 +98,7 @@ def pack(weights: bytes) -> tuple[bytes, Literal["float32", "float16"]]:
 
 
 def portable(config: Config) -> Config:
-    """Return a config without its machine's processes, devices, places and servers."""
+    """Return a config without the machine's processes, devices, paths and servers."""
     begun = config.training.pinned
     return replace(
         config,
@@ -119,7 +114,7 @@ def portable(config: Config) -> Config:
 
 
 def build_exported_actor(config: Config, weights: bytes, device: str) -> Actor:
-    """Build the player of exported weights; in float32 on one thread, since rounding depends on how a batch is cut.
+    """Build the player of exported weights, in float32 on one thread: rounding is then the same everywhere.
 
     Raises: Fault.
     """
@@ -129,7 +124,7 @@ def build_exported_actor(config: Config, weights: bytes, device: str) -> Actor:
 
 
 def side_by_side(card: Card, settings: EvaluationConfig, scores: Sequence[float]) -> Table:
-    """Tabulate the card's scores above those that were played with these settings."""
+    """Tabulate the card's scores above those played with these settings."""
     table = Table("", *_COLUMNS)
     for column in table.columns[1:]:
         column.justify = "right"
@@ -142,7 +137,7 @@ def _points(settings: EvaluationConfig, scores: Sequence[float]) -> Iterator[str
     """Yield the cells of `_COLUMNS`; the interval is of the mean, over episodes."""
     summary = summarize(scores)
     low, high = summary.mean - 1.96 * summary.standard_error, summary.mean + 1.96 * summary.standard_error
-    if len(scores) <= _RESAMPLED:  # of more, the bootstrap takes minutes to say the same
+    if len(scores) <= _RESAMPLED:  # for more, the bootstrap takes minutes and gives the same
         samples = resample([np.array(scores)], _RESAMPLES, np.random.default_rng(0))
         low, high = interval([float(sample.mean()) for sample in samples])
     yield f"{summary.mean:,.0f}"
@@ -152,7 +147,7 @@ def _points(settings: EvaluationConfig, scores: Sequence[float]) -> Iterator[str
 
 
 def metadata(name: str, card: Card) -> str:
-    """Return the YAML that model hubs read at the top of a page; each value as JSON, which is YAML, too."""
+    """Return the YAML that model hubs read at the top of a page; values as JSON, which is YAML."""
     game = card.config.env.id.rsplit("/")[-1]
     reward = f"{np.mean(card.scores):.2f} +/- {np.std(card.scores):.2f}"
     task = {"type": "reinforcement-learning", "name": "reinforcement-learning"}

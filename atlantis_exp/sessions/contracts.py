@@ -1,7 +1,8 @@
-"""The verb `check`: tries each contract on the components that are named, then measures their cost beside ours."""
+"""The verb `check`: try each contract on the named components, then measure their cost next to ours."""
 
 import copy
 import random
+import sys
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ from torch import nn
 
 from atlantis_exp import documents, terminal
 from atlantis_exp.build import build_component, build_trainer, import_components, make_emulator
-from atlantis_exp.config import Config, SamplerConfig
+from atlantis_exp.config import ComponentConfig, Config
 from atlantis_exp.faults import Fault
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.learning.objectives import DQN, Quantile
@@ -34,8 +35,8 @@ from atlantis_exp.training.checkpoint import to_safetensors
 from atlantis_exp.training.plan import Counters
 from atlantis_exp.training.progress import Progress
 
-Trial = tuple[str, str, Callable[[], object]]
-"""A component, its contract, and the call that raises where the contract is broken."""
+Contract = tuple[str, str, Callable[[], object]]
+"""A component, its contract, and a call that raises if the contract is broken."""
 
 _SIDES = (84, 159)  # pixels
 _ACTIONS = 4
@@ -47,14 +48,10 @@ _HEADS: dict[str, Head] = {
 }
 
 
-def check(trials: Iterator[Trial], measured: Mapping[str, Job]) -> None:
-    """Try every contract and, where all are kept, measure what trainings cost, each under its name.
-
-    Raises:
-        Fault: where a contract is broken.
-    """
+def check(contracts: Iterator[Contract], measured: Mapping[str, Job]) -> None:
+    """Try every contract; if all are kept, measure the costs of trainings, by name. Raises: Fault otherwise."""
     tried = list[documents.Trial]()
-    for part, contract, trial in trials:
+    for part, contract, trial in contracts:
         because = ""
         try:
             with terminal.working(f"{part}: {contract}"):
@@ -79,11 +76,8 @@ def check(trials: Iterator[Trial], measured: Mapping[str, Job]) -> None:
         raise Fault(f"broken: {', '.join(broken)}")
 
 
-def trials(config: Config, small: Job, kinds: Collection[str]) -> Iterator[Trial]:
-    """Return every contract of a config's components of these kinds.
-
-    small: the same components in a training of seconds, which is killed and continued.
-    """
+def contracts_of(config: Config, small: Job, kinds: Collection[str]) -> Iterator[Contract]:
+    """Yield every contract of a config's components of these kinds; `small` is a training of them of seconds."""
     import_components(config)
     if "model" in kinds:
         network = f"model={config.model.name}"
@@ -106,9 +100,11 @@ def trials(config: Config, small: Job, kinds: Collection[str]) -> Iterator[Trial
             yield f"sampler={name}", "a batch of available transitions", partial(_draws, config, part)
             yield f"sampler={name}", "state there and back", partial(_sampler_continues, config, part)
     if "epsilon" in kinds:
-        yield f"epsilon={config.epsilon.name}", "in [0, 1], before and past the end", partial(_epsilon_holds, config)
+        trial = partial(_schedule_holds, config, config.epsilon, 1.0)
+        yield f"epsilon={config.epsilon.name}", "in [0, 1], before and past the end", trial
     if "lr_schedule" in kinds:
-        yield f"lr_schedule={config.lr_schedule.name}", "finite, not negative", partial(_rate_holds, config)
+        trial = partial(_schedule_holds, config, config.lr_schedule, sys.float_info.max)
+        yield f"lr_schedule={config.lr_schedule.name}", "finite, not negative", trial
     if "env" in kinds:
         yield f"env.id={config.env.id}", "actions are ALE's, points sum to rewards", partial(_pays, config)
     yield "all", "killed and continued is unbroken, bit for bit", partial(_resumes, small)
@@ -135,9 +131,8 @@ def _states(config: Config, count: int) -> torch.Tensor:
 def _learns(config: Config, head: str, side: int, precision: Any) -> None:
     network, target = _made(config, side, head), _made(config, side, head)
     objective = Quantile(_QUANTILES) if head == "quantile" else DQN()
-    learner = Learner(
-        network, target, torch.optim.SGD(network.parameters(), lr=1e-3), objective, 1.0, precision=precision
-    )
+    optimizer = torch.optim.SGD(network.parameters(), lr=1e-3)
+    learner = Learner(network, target, optimizer, objective, 1.0, precision=precision)
     states = np.random.default_rng(0).integers(0, 256, (6, config.env.stack, side, side), np.uint8)
     _hold(learner.q_values(states).shape == (6, _ACTIONS), f"values of shape {learner.q_values(states).shape}")
     before = copy.deepcopy(network.state_dict())
@@ -199,13 +194,9 @@ def _values(config: Config, seed: int) -> torch.Tensor:
 
 
 def _targets(config: Config, discount: float, seed: int) -> torch.Tensor:
-    targets: torch.Tensor = build_component(config, config.objective).targets(
-        torch.arange(6.0),
-        torch.arange(6),
-        torch.full((6,), discount),
-        lambda _: _values(config, seed),
-        lambda _: _values(config, seed + 9),
-    )
+    batch = torch.arange(6.0), torch.arange(6), torch.full((6,), discount)  # rewards, stand-ins for states, discounts
+    q_functions = (lambda _: _values(config, seed)), (lambda _: _values(config, seed + 9))
+    targets: torch.Tensor = build_component(config, config.objective).targets(*batch, *q_functions)
     return targets
 
 
@@ -233,7 +224,7 @@ def _memory() -> ReplayMemory:
     return memory
 
 
-def _draws(config: Config, part: SamplerConfig) -> None:
+def _draws(config: Config, part: ComponentConfig) -> None:
     memory, sampler = _memory(), build_component(config, part)
     with _no_global_stream():
         drawn = sampler.sample(memory, 16, np.random.default_rng(0))
@@ -243,7 +234,7 @@ def _draws(config: Config, part: SamplerConfig) -> None:
     _hold(memory.available(drawn.ids).all(), "a transition that is not available")
 
 
-def _sampler_continues(config: Config, part: SamplerConfig) -> None:
+def _sampler_continues(config: Config, part: ComponentConfig) -> None:
     memory = _memory()
     sampler, other = (build_component(config, part) for _ in range(2))
     rng = np.random.default_rng(0)
@@ -254,22 +245,14 @@ def _sampler_continues(config: Config, part: SamplerConfig) -> None:
     other.load_state_dict(copy.deepcopy(sampler.state_dict()))
     for seed in range(3):
         ids = [each.sample(memory, 8, np.random.default_rng(seed)).ids for each in (sampler, other)]
-        _hold((ids[0] == ids[1]).all(), "it draws others than before")
+        _hold((ids[0] == ids[1]).all(), "draws other transitions than before")
 
 
-def _epsilon_holds(config: Config) -> None:
-    values = _scheduled(build_component(config, config.epsilon))
-    _hold(all(0 <= value <= 1 for value in values), f"{min(values)} to {max(values)}")
-
-
-def _rate_holds(config: Config) -> None:
-    values = _scheduled(build_component(config, config.lr_schedule))
-    _hold(all(0 <= value < float("inf") for value in values), f"{min(values)} to {max(values)}")
-
-
-def _scheduled(schedule: Any) -> list[float]:
+def _schedule_holds(config: Config, part: ComponentConfig, highest: float) -> None:
+    schedule = build_component(config, part)
     with _no_global_stream():
-        return [float(schedule(step / 100, 1_000 * step)) for step in range(151)]
+        values = [float(schedule(step / 100, 1_000 * step)) for step in range(151)]
+    _hold(all(0 <= value <= highest for value in values), f"{min(values)} to {max(values)}")
 
 
 def _pays(config: Config) -> None:
@@ -294,7 +277,7 @@ def _resumes(small: Job) -> None:
 
 
 def _costs(jobs: Mapping[str, Job]) -> list[documents.Cost]:
-    """Measure trainings on this machine; an update includes drawing its batch."""
+    """Measure trainings on this machine; an update includes the draw of its batch."""
     costs = []
     for name, job in jobs.items():
         config = job.config

@@ -36,7 +36,7 @@ from atlantis_exp.training.evaluation import Evaluation, Stopped
 from atlantis_exp.training.progress import Progress
 
 STORED = ("latest", "best")
-"""The weights that a stored run has; what else `weights` names is a folder of exported ones."""
+"""The weights of a stored run; any other value of `weights` names a folder of exported ones."""
 
 
 def evaluate(
@@ -53,7 +53,7 @@ def evaluate(
 ) -> RunFolder:
     """Play a network on its own environment, print the report's table, and return the folder that records it.
 
-    An exported network plays by the protocol of its card, as far as no key in `asked` says otherwise.
+    An exported network plays by the protocol of its card, except for keys in `asked`.
     """
     outputs = Path(paths.outputs)
     catch_up(outputs, tracking.uri)
@@ -66,14 +66,14 @@ def evaluate(
         actor = build_network_actor(trained, stored, device)
     else:
         if "run" in asked:
-            raise ConfigError(f"run={run}: weights={weights} are of no run here; drop one of the two")
+            raise ConfigError(f"run={run}: weights={weights} names exported weights; drop one of the two")
         card, stored = read_card(Path(weights))
         trained, step = card.config, card.step
         name = title = Path(weights).resolve().name
         source = {"weights": name, "sha256": card.sha256}
         protocol: dict[str, Any] = {
             key: getattr(card.evaluation, key)
-            # The environments, too: rounding depends on how many states a batch has, and a near tie on rounding.
+            # num_envs, too: rounding, and so the choice in a near tie, depends on the size of a batch.
             for key in ("episodes", "epsilon", "seed", "num_envs")
             if not set(asked) & {"evaluation", f"evaluation.{key}"}
         }
@@ -93,7 +93,7 @@ def evaluate(
 
 
 def _placeable(name: str) -> str:
-    """A name as a folder has it that can come back from a server (`store.PLACE`)."""
+    """Return a name that a run's folder may have."""
     return re.sub(r"[^A-Za-z0-9_.,~+=@-]+", "-", name).lstrip("_.,~+=@-")[:150] or "weights"
 
 
@@ -110,7 +110,7 @@ def play_baseline(
     command: str,
     cores: int,
 ) -> None:
-    """Let a player without a network play, print the report's table, and record it all as the run `name`."""
+    """Let a player without a network play, print the report's table, and record the run `name`."""
     outputs = Path(paths.outputs)
     catch_up(outputs, tracking.uri)
     facts = _facts(agent=agent, env=env, evaluation=evaluation, tracking=tracking, paths=paths)
@@ -133,9 +133,9 @@ def play(
     command: str,
     cores: int,
 ) -> None:
-    """Let a person play, print the report's table, and record it all.
+    """Let a person play at the game's 60 frames a second, print the report's table, and record it.
 
-    The game runs at its 60 frames a second; picture and keys follow its steps, as for the networks.
+    Picture and keys follow its steps, as for the networks.
     """
     outputs = Path(paths.outputs)
     catch_up(outputs, tracking.uri)
@@ -166,7 +166,7 @@ def _facts(**parts: Any) -> dict[str, Any]:
 
 @contextmanager
 def _held(folder: RunFolder) -> Iterator[None]:
-    """Hold a run's folder: no game is played that it could not keep. A new one goes where nothing was recorded."""
+    """Hold a run's folder before a game is played; remove a new one if nothing was recorded."""
     is_new = not folder.path.exists()
     with folder.held():
         try:
@@ -195,7 +195,7 @@ def _record(
     shown: Mapping[str, str],
     command: str,
 ) -> None:
-    """Print an evaluation as the report does, and keep it as a run of its own, held already; `facts` are its params."""
+    """Print an evaluation as the report does, and record it in a held folder with `facts` as its params."""
     evaluation, video = played
     print(f"\n{evaluation.report()}\n")
     with publishing(folder, tracking, outputs, shown) as journal:

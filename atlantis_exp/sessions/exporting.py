@@ -1,4 +1,4 @@
-"""Export a stored run's network as a folder: play it as it will be handed on, then write it with its card."""
+"""Export a stored run's network as a folder: play it in its exported form, then write it with its card."""
 
 import hashlib
 import re
@@ -34,7 +34,7 @@ def export(
     paths: PathsConfig,
     cores: int,
 ) -> None:
-    """Play the network as it will be handed on, then write it with a card, all of it or nothing."""
+    """Play the network in its exported form, then write it with a card, whole or not at all."""
     if onnx:
         from atlantis_exp.sessions.onnx import export_onnx, require
 
@@ -56,7 +56,7 @@ def export(
     settings = replace(evaluation, video=False, num_envs=evaluation.at_once)
     progress = Progress()
     try:
-        with whole(folder) as place:  # before the episodes, lest there be no place for their scores
+        with whole(folder) as place:  # before the episodes: the place may be refused
             progress.say(f"{source.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
             played = build_evaluator(trained.env, settings, cores)(actor, settings.episodes, progress)
             card = Card(
@@ -81,7 +81,7 @@ def export(
 
 
 def _history(run: RunFolder, step: int) -> tuple[dict[str, float], dict[str, str]]:
-    """Return how far a training was at a step, and what made it. Raises: Fault if its journal is damaged."""
+    """Return a training's counters at a step, and its origin. Raises: Fault if its journal is damaged."""
     reached: dict[str, float] = {}
     tags: dict[str, str] = {}
     for record in run.records():
@@ -96,10 +96,10 @@ def _history(run: RunFolder, step: int) -> tuple[dict[str, float], dict[str, str
 
 
 def _without_places(command: str) -> str:
-    """Return a command without this machine's outputs and servers, other paths cut to their last part."""
+    """Return a command without this machine's outputs and servers, and with the names of other paths alone."""
     try:
         words = shlex.split(command)
-    except ValueError:  # not a shell's: forged
+    except ValueError:  # forged
         return ""
     kept = (word for word in words if not re.match(r"[+~]*(paths|tracking)\.", word))
     return shlex.join(re.sub(r"(?<![\w.])(~[^/]*|\.{0,2})/([^,'\[\]]*/)?", "./", word) for word in kept)

@@ -1,4 +1,4 @@
-"""One training as it was asked for: its config, what people call it, and the command that repeats it."""
+"""One training as it was asked for: its config, its title, and the command that repeats it."""
 
 import re
 import shlex
@@ -14,41 +14,39 @@ from atlantis_exp.terminal import PROGRAM
 
 @dataclass(frozen=True)
 class Job:
-    """A training to be done by this process, perhaps one of many of a sweep."""
+    """A training for this process, perhaps one of a sweep."""
 
     config: Config
-    words: tuple[str, ...] = ()  # what was asked for besides network, sampler and seed, in few words
+    words: tuple[str, ...] = ()  # the choices besides network, sampler and seed, in short
     overrides: tuple[str, ...] = ()  # as typed, of this job alone
     machine: Machine = field(default_factory=here)
 
     @property
     def launcher(self) -> str | None:
-        """The launcher of the sweep that this process does one job of."""
+        """The launcher of this process's sweep."""
         return self.machine.launcher
 
     @property
     def command(self) -> str:
-        """What a person types to continue the run or to see its result."""
+        """The command that continues the run or shows its result."""
         return command_line(*self.overrides)
 
     @property
     def title(self) -> str:
-        """What people call the run: network, samplers, seed, then what else was asked for: `resnet top_half s1`."""
+        """The name that people read: network, samplers, seed, then other choices: `resnet top_half s1`."""
         return " ".join([*self._player, f"s{self.config.seed}", *self.words])
 
     @property
     def group(self) -> str:
-        """The title that runs which differ only in their seed have in common."""
+        """The common title of runs that differ only in their seed."""
         return " ".join([*self._player, *self.words])
 
     @property
     def colour(self) -> str:
-        """The colour of all runs with this network and, in the end, this sampler."""
         return config_colour(self.config)
 
     @property
     def outputs(self) -> Path:
-        """Where everything goes that is written."""
         return Path(self.config.paths.outputs)
 
     @property
@@ -58,18 +56,18 @@ class Job:
 
 
 def replaced(overrides: Iterable[str], *others: str) -> list[str]:
-    """Overrides with others in the place of those that have their keys."""
+    """Return overrides with some replaced or added."""
     keys = {text.partition("=")[0] for text in others}
     return [*(text for text in overrides if text.partition("=")[0].lstrip("+") not in keys), *others]
 
 
 def command_line(*arguments: str) -> str:
-    """A command of ours as a shell takes it."""
+    """Return one of our commands, quoted for a shell."""
     return " ".join((PROGRAM, *map(shlex.quote, arguments)))
 
 
 def quoted(value: str) -> str:
-    """A text as Hydra takes it, in quotes where it would read something else in it."""
+    """Return a text as Hydra reads it, in quotes if needed."""
     if re.fullmatch(r"[\w/.+-]+", value, re.ASCII):
         return value
     escaped = value.replace("'", r"\'")
@@ -77,19 +75,19 @@ def quoted(value: str) -> str:
 
 
 def config_colour(config: Config) -> str:
-    """The colour of all runs with this config's network and last sampler."""
+    """Return the colour of all runs with this config's network and last sampler."""
     from atlantis_exp.media import run_colour  # numpy, without which a command line is checked
 
     return run_colour(config.model.name, list(config.phase.values())[-1].sampler)
 
 
 def labels(title: str, colour: str, kind: str) -> dict[str, str]:
-    """The tags by which MLflow shows a run, and tells trainings, sweeps, comparisons apart."""
+    """Return the tags of a run's name, colour and kind in MLflow."""
     return {"mlflow.runName": title, "mlflow.runColor": colour, "atlantis.kind": kind}
 
 
 def fitted(lines: Sequence[str], room: int, rest: str) -> str:
-    """Return as many lines of a note as have room, in characters, then how many more are in `rest`."""
+    """Return the lines of a note that fit in `room` characters, then the number of others, which `rest` has."""
     text = "\n".join(lines)
     if len(text) <= room:
         return text

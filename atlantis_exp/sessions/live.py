@@ -1,4 +1,4 @@
-"""A sweep's runs while other processes train them: one table on a terminal, plain lines elsewhere."""
+"""Show a sweep's runs while other processes train them: a table on a terminal, plain lines elsewhere."""
 
 import time
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ _ORDER: tuple[State, ...] = ("running", "failed", "interrupted", "done", "queued
 
 @dataclass
 class _Run:
-    """What a run's journal says as of its last commit, of which only what is new is read."""
+    """A run as of its last commit; only the new part of its journal is read."""
 
     title: str
     folder: RunFolder
@@ -48,7 +48,6 @@ class _Run:
 
     @property
     def done(self) -> int:
-        """Of the plan, in its unit."""
         return int(self.values.get("throughput/episodes", 0)) if self.unit == "episodes" else self.step
 
     @property
@@ -67,7 +66,7 @@ class _Run:
         )
 
     def _left(self) -> str:
-        """At the speed shown, as the run's own line; of a plan in episodes, whose steps nobody knows, at its mean."""
+        """Return the time left at the speed shown; for a plan in episodes, at the mean of all so far."""
         hours, speed = self.values.get("throughput/hours"), self.values.get("throughput/steps_per_second")
         if self.state != "running" or not hours or not speed or not self.done:
             return ""
@@ -77,7 +76,7 @@ class _Run:
 
 
 class LiveTable:
-    """Shows what the folders of a sweep's runs say; `look` is to be called every `seconds`."""
+    """Shows the runs of a sweep; call `look` every `seconds`."""
 
     def __init__(self, jobs: Sequence[Job], folders: Sequence[RunFolder], console: Console | None = None) -> None:
         self._console = console or terminal.console()
@@ -87,9 +86,9 @@ class LiveTable:
         self.seconds = 1.0 if self._console.is_terminal else 30.0
 
     def look(self) -> None:
-        """Read what is new, and show it."""
+        """Read the new parts of the journals, and show them."""
         for run in self._runs:
-            with suppress(OSError, ValueError, Fault):  # of a damaged journal, which the run's own command names
+            with suppress(OSError, ValueError, Fault):  # a damaged journal, which the run's own command reports
                 run.look()
         if self._console.is_terminal:
             self._draw()
@@ -97,13 +96,12 @@ class LiveTable:
             self._say()
 
     def close(self) -> None:
-        """End the table."""
         if self._live is not None:
             self._live.stop()
 
     def _draw(self) -> None:
         table = Table("run", "state", "as of its last commit", "steps/s", "left", "last score", box=None)
-        for run in sorted(self._runs, key=lambda run: _ORDER.index(run.state)):  # those that matter, if not all fit
+        for run in sorted(self._runs, key=lambda run: _ORDER.index(run.state)):  # the last ones may not fit
             table.add_row(*run.cells)
         if self._live is None:
             self._live = Live(console=self._console, auto_refresh=False, transient=True)
@@ -113,7 +111,7 @@ class LiveTable:
     def _say(self) -> None:
         for run in self._runs:
             name, state, done, speed, left, score = run.cells
-            news = state, done, speed, score  # that time passes is none
+            news = state, done, speed, score  # but not the time left
             if self._said.get(name, ("queued", "", "", "")) != news:
                 self._said[name] = news
                 parts = [done, speed and f"{speed} steps/s", left and f"left {left}", score and f"last score {score}"]

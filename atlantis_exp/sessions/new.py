@@ -1,11 +1,11 @@
-"""A package with a component to begin with: one of the examples under another name, a test, README and entry point."""
+"""Write a package with a component to start from: an example under a new name, with test, README and entry point."""
 
 import re
-import tempfile
 from pathlib import Path
 
 from atlantis_exp.checking import check_new
 from atlantis_exp.components import ENTRY_POINTS
+from atlantis_exp.runs.files import whole, write_file
 from atlantis_exp.terminal import PROGRAM
 
 EXAMPLES = {
@@ -55,7 +55,7 @@ def test_it_keeps_every_contract() -> None:
 
 
 def begin(kind: str, name: str, folder: Path, examples: Path) -> None:
-    """Write a package with a component that plays, whole or not at all. Raises: ConfigError."""
+    """Write a package with a working component, whole or not at all. Raises: ConfigError."""
     check_new("to", folder)
     example, suffix = EXAMPLES[kind]
     source = (examples / f"{example}.py").read_text()
@@ -76,11 +76,8 @@ def begin(kind: str, name: str, folder: Path, examples: Path) -> None:
         package / "__init__.py": f'"""A component of atlantis_exp: {kind}={name}."""\n',
         package / f"{name}.py": re.sub(rf"\b{example.title()}{suffix}\b", own + suffix, source),
     }
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent) as aside:
+    with whole(folder) as aside:
         for path, text in files.items():
-            (Path(aside) / "new" / path).parent.mkdir(parents=True, exist_ok=True)
-            (Path(aside) / "new" / path).write_text(text)
-        (Path(aside) / "new").rename(folder)
+            write_file(aside / path, text.encode())
     print(*(folder / path for path in files), sep="\n")
     print(f"\n{PROGRAM} check {kind}={name} plugins={folder / package / name}.py")

@@ -1,4 +1,4 @@
-"""Write a network as ONNX, to play without torch, and compare its values with torch's."""
+"""Write a network as ONNX, which plays without torch, and compare its values with torch's."""
 
 import logging
 import warnings
@@ -23,15 +23,15 @@ _TOLERANCE = 1e-4  # of the largest value, between float32 in torch and in ONNX 
 
 
 class Exported(NamedTuple):
-    """A network as ONNX, and how far its values are from torch's."""
+    """A network as ONNX, and its difference from torch."""
 
     content: bytes
     states: int
-    difference: float  # the largest, in units of the values
+    difference: float  # the largest of a value
 
 
 class _Values(nn.Module):
-    """What `ActionValues` computes: states (B, C, H, W) in 0..255 to the values of actions (B, A)."""
+    """Maps states (B, C, H, W) in 0..255 to values of actions (B, A), as `ActionValues` does."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
@@ -42,7 +42,7 @@ class _Values(nn.Module):
 
 
 def require() -> None:
-    """Raise ConfigError where what writes and asks ONNX is not installed."""
+    """Raise ConfigError if the ONNX packages are not installed."""
     if not all(map(find_spec, ("onnx", "onnxscript", "onnxruntime"))):
         raise ConfigError("onnx=true: needs pip install 'atlantis-exp[onnx]'")
 
@@ -50,15 +50,13 @@ def require() -> None:
 def export_onnx(config: Config, weights: bytes) -> Exported:
     """Return a network as ONNX: `states`, uint8 (batch, stack, size, size), to `q_values`, float32 (batch, actions).
 
-    Both are asked about the same states of a game.
-
     Raises:
-        Fault: it cannot be written, or its values are not torch's.
+        Fault: it cannot be written, or its values on states of a game are not torch's.
     """
     network = build_trained_network(config, weights).eval()
     shape = config.env.stack, config.env.size, config.env.size
     before = logging.root.manager.disable
-    logging.disable(logging.WARNING)  # of torchvision, which is not there
+    logging.disable(logging.WARNING)  # torch warns that torchvision is missing
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -81,12 +79,12 @@ def export_onnx(config: Config, weights: bytes) -> Exported:
     here, there = _both(config, network, content)
     difference = float(np.abs(here - there).max())
     if not difference <= _TOLERANCE * max(1.0, float(np.abs(here).max())):
-        raise Fault(f"the network says something else as ONNX: its values are up to {difference:g} from torch's")
+        raise Fault(f"the network differs as ONNX: its values are up to {difference:g} from torch's")
     return Exported(content, len(here), difference)
 
 
 def _both(config: Config, network: nn.Module, content: bytes) -> tuple[Values, Values]:
-    """Return the values of torch and of ONNX Runtime in the states of a game that is played by chance."""
+    """Return the values of torch and of ONNX Runtime in the states of a game played by chance."""
     import onnxruntime
 
     env, emulator = config.env, make_emulator(config.env)()

@@ -1,8 +1,8 @@
 """A search for the best values of any keys, by Optuna.
 
-A search is a folder: Optuna's journal of the trials, a lock for each of them, and a page that the trials' runs are
-shown under. Any number of processes may work on it. A trial whose process was killed is one whose lock nobody holds:
-the next process that looks for work continues it, and finds its runs again by their identity.
+A search is a folder: Optuna's journal of the trials, a lock for each of them, and a page for their runs. Several
+processes may work on it. A trial whose lock nobody holds was killed: the next process continues it, and finds its runs
+by their identity.
 """
 
 import os
@@ -53,13 +53,13 @@ class Search:
     space: Mapping[str, BaseDistribution]
     texts: Mapping[str, str]  # the space, as typed
     overrides: Sequence[str]  # of the training, as typed
-    job_of: Callable[[Sequence[str]], Job]  # the training that overrides make; raises ConfigError
+    job_of: Callable[[Sequence[str]], Job]  # the training of some overrides; raises ConfigError
     corner: Job  # one of the trainings in the space
     trials: int
     seeds: int  # trainings a trial
-    name: str | None  # of its folder; None: made from what is searched, and over which training
+    name: str | None  # of its folder; None: a hash of the space and the training
     startup: int  # trials drawn at random
-    pruned_after: int | None  # trials that have ended before any is cut short; None: none ever is
+    pruned_after: int | None  # trials that end before any is cut short; None: none is
     spared: int  # first evaluations, at which a trial is never cut short
     command: str  # that continues it
 
@@ -68,11 +68,11 @@ Train = Callable[[Job, Callable[[Trainer], bool]], int | None]
 
 
 def search(asked: Search, train: Train = train) -> None:
-    """Train one trial after the other, each with the values that Optuna proposes, until there are as many as asked for.
+    """Train one trial after the other, with the values that Optuna proposes.
 
     Raises:
         ConfigError: the folder is another search's.
-        Fault: the disk refuses, the time is over, or no trial has ended well.
+        Fault: the disk refuses, the time is over, or no trial was trained to its end.
     """
     config, again = asked.corner.config, f"the search goes on with: {asked.command}"
     stop = StopRequest(config.budget.seconds)
@@ -97,7 +97,7 @@ def search(asked: Search, train: Train = train) -> None:
                         if trial is not None:
                             trials.train(trial, stop)
                     if trial is None:
-                        time.sleep(_WAIT_SECONDS)  # for the trials of other processes, one of which may be killed
+                        time.sleep(_WAIT_SECONDS)  # another process may leave its trial
         except SystemExit:
             terminal.warn(again)
             raise
@@ -112,7 +112,7 @@ class Trials:
     def __init__(self, asked: Search, train: Train = train) -> None:
         config = asked.corner.config
         facts = {"space": dict(asked.texts), "training": config.science(), "budget.steps": config.budget.steps}
-        if asked.seeds > 1:  # an older search names none
+        if asked.seeds > 1:  # searches of older versions have no such key
             facts["seeds"] = asked.seeds
         name = asked.name or f"search-{digest(facts)}"
         self.asked, self._train = asked, train
@@ -125,18 +125,17 @@ class Trials:
 
     @property
     def all(self) -> list[FrozenTrial]:
-        """All trials so far, each at its number."""
+        """All trials so far, in order of their numbers."""
         return self.study.get_trials(deepcopy=False)
 
     @property
     def have_ended(self) -> bool:
-        """Whether there is nothing left to train, here or elsewhere."""
         trials = self.all
         return len(trials) >= self.asked.trials and all(trial.state.is_finished() for trial in trials)
 
     @property
     def ranking(self) -> list[tuple[FrozenTrial, list[float]]]:
-        """The values that were trained to their end, the best first: their first trial, the scores of all."""
+        """The first trial of each set of values with the scores of all its trials, the best first."""
         tried: dict[str, tuple[FrozenTrial, list[float]]] = {}
         for trial in self.all:
             if trial.state == TrialState.COMPLETE:
@@ -148,14 +147,14 @@ class Trials:
         return ending(error) if error or self.have_ended else ("KILLED", "")
 
     def counts(self) -> str:
-        """Return how many trials there are, and in which states."""
+        """Return the number of trials, in all and by state."""
         states = Counter(trial.state.name.lower() for trial in self.all)
         each = [f"{count} {state}" for state, count in states.items()]
         return ", ".join([f"{states.total()} of {self.asked.trials} trials", *each])
 
     @contextmanager
     def claimed(self) -> Iterator[Trial | None]:
-        """Hold the trial to be trained next while the block runs: one that a killed process left, or a new one."""
+        """Hold the next trial for the block: one that a killed process left, or a new one; None if none is left."""
         with ExitStack() as held:
             trial = None
             with alone(self.folder.path / "alone.lock"):
@@ -164,19 +163,19 @@ class Trials:
                 if left or len(trials) < self.asked.trials:
                     number = left[0].number if left else len(trials)
                     held.enter_context(self._lock(number).held())
-                    # A seed a trial: processes with one seed would propose the same, and so would a restarted one.
+                    # A seed a trial: with one seed, several or restarted processes would propose the same.
                     seed = stream(self.asked.corner.config.seed, f"trial {number}").generate_state(1).item()
                     self.study.sampler = TPESampler(seed=seed, n_startup_trials=self.asked.startup)
                     trial = Trial(self.study, left[0]._trial_id) if left else self.study.ask()
                     for key, distribution in self.asked.space.items():
-                        trial._suggest(key, distribution)  # what the killed process drew already stays
+                        trial._suggest(key, distribution)  # keeps values that a killed process drew
             yield trial
 
     def _lock(self, number: int) -> RunFolder:
         return RunFolder(self.folder.path / "trials" / f"{number:04}")
 
     def train(self, trial: Trial, stop: StopRequest) -> None:
-        """Train a trial's runs, from where they are, and tell Optuna the result; nothing where `stop` ended them."""
+        """Train or continue a trial's runs and tell Optuna the result, unless `stop` ended them."""
         scores: list[float] = []
         try:
             for index in range(self.asked.seeds):
@@ -187,9 +186,9 @@ class Trials:
             self.study.tell(trial.number, float(np.mean(scores)))
         except TrialPruned:
             self.study.tell(trial.number, state=TrialState.PRUNED)
-        except (RuntimeError, MemoryError) as error:  # faults, and torch's own, above all where memory is short
+        except (RuntimeError, MemoryError) as error:  # faults, and torch's errors, mostly of memory
             if isinstance(error.__cause__, OSError):
-                raise  # of the machine: no trial would fare better
+                raise  # of the machine: every trial would fail
             if not isinstance(error, Fault):
                 traceback.print_exc()
             trial.set_user_attr("error", str(error) if isinstance(error, Fault) else f"{type(error).__name__}: {error}")
@@ -197,29 +196,28 @@ class Trials:
         print(f"\ntrial {trial.number}: {_described(self.all[trial.number])}; {self.counts()}\n", flush=True)
 
     def _score(self, trial: Trial, index: int, stop: StopRequest) -> float | None:
-        """Train one of a trial's runs; return the mean of its last evaluation, None where `stop` ended it.
+        """Train one of a trial's runs; return the mean of its last evaluation, None if `stop` ended it.
 
-        The mean is what all tables compare. Of the last evaluation, not of the best: the best of several is the
-        luckiest.
+        The last evaluation, since the best of several is the luckiest.
 
         Raises:
             TrialPruned: the trial was cut short, which its first run decides.
             Fault: the run failed.
         """
         job = self.job(trial, index)
-        # The time is the search's, and what is there of a trial is what its killed process left.
+        # The time limit is the search's; an existing run is one that a killed process left.
         config = replace(job.config, resume="auto", budget=replace(job.config.budget, wall_clock=None))
         run = RunFolder.of(config)
         told = self.all[trial.number]
         trial.set_user_attr("runs", [*dict.fromkeys([*told.user_attrs.get("runs", []), run.name])])
-        with suppress(Fault), run.held():  # what runs elsewhere stays where it is
+        with suppress(Fault), run.held():  # unless it is trained elsewhere
             adopt(run.path, self.folder.path)
         seen, pruned, stopped = 0, False, False
 
         def watch(trainer: Trainer) -> bool:
             nonlocal seen, pruned, stopped
             recorder = trainer.recorder
-            # Counted, not by their step: trials whose episodes have other lengths are compared all the same.
+            # By number, not by step: trials may have episodes of other lengths.
             if index == 0 and recorder.evaluations > seen:
                 seen = recorder.evaluations
                 if seen not in told.intermediate_values:
@@ -231,7 +229,7 @@ class Trials:
             return pruned or stopped
 
         if (late := self._train(replace(job, config=config), watch)) is not None:
-            stop.signal = late  # it came when the run had nothing left to stop
+            stop.signal = late  # it came after the run had ended
         if pruned:
             raise TrialPruned
         if stopped:
@@ -243,23 +241,21 @@ class Trials:
         return result.evaluation["evaluation/mean"]
 
     def job(self, trial: FrozenTrial | Trial, index: int) -> Job:
-        """Return one of a trial's trainings. Values that are drawn again are trained with other seeds."""
+        """Return one of a trial's trainings. Values drawn again are trained with other seeds."""
         before = sum(other.params == trial.params for other in self.all[: trial.number])
         seed = self.asked.corner.config.seed + before * self.asked.seeds + index
         return self.asked.job_of([*replaced(self.asked.overrides, f"seed={seed}"), *_values(trial)])
 
     def conclusion(self) -> list[str]:
-        """Return what the ranking is worth, and the commands that test its best values and train them in full.
+        """Return the ranking's caveats and the commands that test its best values and train them in full.
 
-        `decide` trains other seeds than a search, so that the luck of the search does not enter its answer.
+        `decide` trains other seeds, so that the luck of the search does not enter its answer.
         """
         if not (ranking := self.ranking):
             return []
         best, asked, lines = ranking[0][0], self.asked, []
         if all(len(scores) == 1 for _, scores in ranking):
-            lines.append(
-                "One training each: other seeds may rank the values differently; seeds=3 trains three a trial."
-            )
+            lines.append("One training each: other seeds may rank them differently; seeds=3 trains three a trial.")
         if len(ranking) > 1:
             lines.append(f"The best of {len(ranking)} is partly luck: its own mean is optimistic.")
         job = self.job(best, 0)
@@ -273,7 +269,7 @@ class Trials:
         return [*lines, f"The best in full: {command_line(*full)}"]
 
     def describe(self, journal: Journal) -> None:
-        """Write to the search's page how the trials stand."""
+        """Write the trials to the search's page."""
         told = {record.step for record in self.folder.records() if isinstance(record, Metrics)}
         best, rows = float("-inf"), ["| trial | values and result | runs |", "| ---: | --- | --- |"]
         for trial in self.all:
@@ -282,18 +278,14 @@ class Trials:
                 best = max(best, trial.value)
                 if trial.number not in told:
                     journal.metrics({"search/mean": trial.value, "search/best": best}, trial.number)
-        above = "\n\n".join(
-            [
-                f"{self.counts()}. Continue, or help along from another terminal: `{self.asked.command}`",
-                *self.conclusion(),
-                f"Figures: `optuna-dashboard {self.folder.path / 'trials.jsonl'}`",
-            ]
-        )
+        more = f"{self.counts()}. Continue, or help along from another terminal: `{self.asked.command}`"
+        figures = f"Figures: `optuna-dashboard {self.folder.path / 'trials.jsonl'}`"
+        above = "\n\n".join([more, *self.conclusion(), figures])
         journal.note(f"{above}\n\n{fitted(rows, NOTE_LENGTH - len(above), '`trials.jsonl`')}")
         journal.flush()
 
     def print_results(self) -> None:
-        """Print the best values, and what they are worth. Raises: Fault where there are none."""
+        """Print the best values and their caveats. Raises: Fault if there are none."""
         if not (ranking := self.ranking):
             raise Fault(f"search {self.folder.name}: no trial was trained to its end; {self.counts()}")
         table = Table("trial", "mean", "95 %", *self.asked.space, "run", title=f"{self.folder.name}: {self.counts()}")
@@ -318,7 +310,7 @@ def _study(file: Path, asked: Search) -> Study:
             own(file)  # Optuna writes it in place
             lock = JournalFileSymlinkLock(str(file))  # all processes write under it
             lock.acquire()
-            try:  # to drop the end of a line that a process was killed in: the next would be written behind it
+            try:  # drop a last line that a killed process left unfinished
                 os.truncate(file, read_file(file, ARTIFACT).rfind(b"\n") + 1)
             finally:
                 lock.release()
@@ -331,7 +323,7 @@ def _study(file: Path, asked: Search) -> Study:
         )
     except OSError:
         raise
-    except Exception as error:  # Optuna checks nothing of what it reads
+    except Exception as error:  # Optuna does not check its file
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise Fault(
             f"{file} is damaged ({reason}): restore it, or begin anew with another name=, which finds the trials' "
@@ -340,7 +332,7 @@ def _study(file: Path, asked: Search) -> Study:
 
 
 def _interval(scores: Sequence[float]) -> str:
-    """Return the 95 % interval of a mean, by Student's t over its own trainings."""
+    """Return the 95 % interval of a mean, by Student's t over its trainings."""
     if (count := len(scores)) == 1:
         return "one training"
     half = t.ppf(0.975, count - 1) * np.std(scores, ddof=1) / np.sqrt(count)
@@ -357,7 +349,6 @@ def _values(trial: Trial | FrozenTrial) -> list[str]:
 
 def _described(trial: FrozenTrial) -> str:
     """Return a trial's values and its result."""
-    result = trial.state.name.lower()
     match trial.state:
         case TrialState.COMPLETE:
             result = f"mean {trial.value:,.0f}"
@@ -365,6 +356,8 @@ def _described(trial: FrozenTrial) -> str:
             result = f"pruned at evaluation {trial.last_step} with mean {trial.value:,.0f}"
         case TrialState.FAIL:
             result = f"failed: {trial.user_attrs['error']}"
+        case state:
+            result = state.name.lower()
     return f"{' '.join(f'{key}={_short(value)}' for key, value in trial.params.items())}, {result}"
 
 

@@ -1,4 +1,4 @@
-"""How a training is asked to stop: by a signal, by the end of its time, or because its sweep has ended."""
+"""Ask a training to stop: by a signal, at the end of its time, or because its sweep has ended."""
 
 import signal
 import sys
@@ -17,13 +17,11 @@ _LOOK_SECONDS = 1.0  # between two looks at whether the sweep goes on
 
 
 class StopRequest:
-    """Turns the first SIGINT, SIGTERM or SIGUSR2, or the end of the time, into a flag that the trainer looks at.
+    """Turns SIGINT, SIGTERM, SIGUSR2, the end of the time or of the sweep into a flag that the trainer asks for.
 
-    The time begins with the first look, after the first step: a session whose set-up takes longer makes progress, too.
-
-    So does the end of the sweep that the run is a job of, as `sweep_goes_on` tells it. A second SIGINT ends the process
-    at once; what was committed stays. Under Slurm SIGTERM is a warning: the run is committed and goes on, since Slurm
-    itself requeues or kills it.
+    The time begins with the first look, after the first step, so that a session with a long set-up makes progress. A
+    second SIGINT ends the process at once; the last commit stays. Under Slurm SIGTERM is a warning: the run is
+    committed and goes on, since Slurm itself requeues or kills it.
     """
 
     def __init__(
@@ -44,7 +42,7 @@ class StopRequest:
 
     def __call__(self) -> bool:
         now = time.monotonic()
-        if self._seconds is not None and self._deadline == inf:  # the first step is made: set-up is no part of the time
+        if self._seconds is not None and self._deadline == inf:
             self._deadline = now + self._seconds
         if now - self._looked >= _LOOK_SECONDS:
             self._looked = now
@@ -52,12 +50,12 @@ class StopRequest:
         return self.signal is not None or self._is_warned or self._sweep_has_ended or now >= self._deadline
 
     def was_a_warning(self) -> bool:
-        """Whether the run is to go on once it is committed; forgets the warning."""
+        """Tell whether the run goes on after its commit; forget the warning."""
         was_warned, self._is_warned = self._is_warned, False
         return was_warned and self.signal is None
 
     def end(self, message: str) -> NoReturn:
-        """End the process as the request wants it; raises Fault for the end of the time, so that a sweep goes on."""
+        """End the process by the signal's exit code. Raises: Fault if none came, so that a sweep goes on."""
         if self.signal is None and self._sweep_has_ended:
             raise Fault(f"the sweep has ended: {message}", exit_code=128 + signal.SIGTERM)
         if self.signal is None:
@@ -85,13 +83,13 @@ class StopRequest:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
             signal.raise_signal(signal.SIGINT)
         if number == signal.SIGTERM and self._under_slurm:
-            self._is_warned = True  # apart, as a SIGUSR2 before it still means that the job is to be requeued
+            self._is_warned = True  # a SIGUSR2 before it still requeues the job
         else:
             self.signal = number
 
 
 def sweep_goes_on(folder: RunFolder, launcher: str | None) -> Callable[[], bool]:
-    """Return a call that tells whether the process that launched this job still wants it; Slurm's jobs outlive it."""
+    """Return a call that tells whether the launcher of this job is alive; Slurm's jobs may outlive it."""
     if folder.parent is None or launcher != "joblib":
         return lambda: True
     sweep = RunFolder(folder.parent)

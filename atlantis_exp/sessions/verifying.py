@@ -1,4 +1,4 @@
-"""Is a training that is killed again and again the unbroken one?"""
+"""Verify that a training that is killed and continued equals the unbroken one."""
 
 import json
 import math
@@ -29,8 +29,8 @@ from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.fingerprint import fingerprint
 
 _KILLS = 3
-_EARLY_SECONDS = 10.0  # that a session takes to start
-_SAID, _SAYS = "stderr.txt", "stdout.txt"  # of the latest session
+_EARLY_SECONDS = 10.0  # in which a session starts
+_ERRORS, _OUTPUT = "stderr.txt", "stdout.txt"  # of the latest session
 
 
 def verify_resume(job: Job) -> None:
@@ -42,10 +42,10 @@ def verify_resume(job: Job) -> None:
         for name in ("unbroken", "killed"):
             shutil.rmtree(folder.path / name, ignore_errors=True)
         print(f"training {config.run_name()} unbroken", flush=True)
-        with terminal.working("  unbroken", partial(_last_line, folder.path / "unbroken" / _SAYS)):
+        with terminal.working("  unbroken", partial(_last_line, folder.path / "unbroken" / _OUTPUT)):
             train_and_kill(config, overrides, folder.path / "unbroken", 0)
         print(f"training it again, killed {_KILLS} times", flush=True)
-        with terminal.working("  killed and continued", partial(_last_line, folder.path / "killed" / _SAYS)):
+        with terminal.working("  killed and continued", partial(_last_line, folder.path / "killed" / _OUTPUT)):
             kills = train_and_kill(config, overrides, folder.path / "killed", _KILLS)
         with terminal.working("comparing the two"):
             unbroken, killed = (fingerprints(config, folder.path / name) for name in ("unbroken", "killed"))
@@ -69,32 +69,30 @@ def verify_resume(job: Job) -> None:
 
 
 def train_and_kill(config: Config, overrides: Sequence[str], outputs: Path, kills: int) -> int:
-    """Train under `outputs`, with a SIGKILL at a random moment after a commit, `kills` times; returns how many struck.
+    """Train under `outputs` and kill it at a random moment after a commit, `kills` times; return how many struck.
 
     Raises:
         Fault: a session ended with an error.
     """
-    # When commits happen changes nothing, and without one there is nothing to continue from.
+    # The moments of commits change nothing, and a run continues from one.
     own = (f"paths.outputs={outputs}", "tracking.commit_seconds=1.0", "resume=auto")
     command = (sys.executable, "-m", "atlantis_exp", "train", *replaced(overrides, *own))
     return run_and_kill(lambda said: start(command, said), outputs, config.run_name(), kills)
 
 
 class Session(Protocol):
-    """A process that trains."""
+    """A process that trains; `poll` and `wait` as of Popen."""
 
     pid: int
 
-    def poll(self) -> int | None:
-        """Its exit code, None while it runs."""
+    def poll(self) -> int | None: ...
 
-    def wait(self) -> int:
-        """Its exit code, once it has ended."""
+    def wait(self) -> int: ...
 
 
 def start(command: Sequence[str], said: Path) -> Session:
     """Start a command in a process group of its own; stderr goes to the file `said`, stdout to one next to it."""
-    with open(said, "wb") as errors, open(said.with_name(_SAYS), "wb") as lines:
+    with open(said, "wb") as errors, open(said.with_name(_OUTPUT), "wb") as lines:
         return subprocess.Popen(command, stdout=lines, stderr=errors, start_new_session=True)
 
 
@@ -107,9 +105,9 @@ def run_and_kill(
     Up to `kills` times, a session's process group gets a SIGKILL at a random moment within some seconds of a commit.
 
     Args:
-        start: starts a session, the leader of a process group, whose errors go to the file that is handed in.
+        start: starts a session, the leader of a process group, whose stderr goes to the given file.
         runs: the pattern of the runs' names.
-        early: the share of kills at a random moment of a session's first `_EARLY_SECONDS` instead.
+        early: the share of kills in a session's first `_EARLY_SECONDS` instead.
 
     Raises:
         Fault: a session ended with an error.
@@ -118,7 +116,7 @@ def run_and_kill(
     outputs.mkdir(parents=True, exist_ok=True)
     while True:
         before = generations(outputs, runs)
-        session = start(outputs / _SAID)
+        session = start(outputs / _ERRORS)
         moment = time.monotonic() + random.random() * _EARLY_SECONDS if random.random() < early else math.inf
         try:
             while struck < kills and session.poll() is None:
@@ -130,35 +128,34 @@ def run_and_kill(
                     break
             else:
                 if session.wait():
-                    error = (outputs / _SAID).read_text().strip().splitlines()
-                    raise Fault(f"a session under {outputs} failed: {error[-1] if error else 'it said nothing'}")
+                    error = _last_line(outputs / _ERRORS)
+                    raise Fault(f"a session under {outputs} failed: {error or 'it said nothing'}")
                 return struck
-        finally:  # also where a signal ends this process: the session, in a group of its own, has not heard it
+        finally:  # a signal that ends this process does not reach the session, in a group of its own
             with suppress(ProcessLookupError):  # it has just ended
                 os.killpg(session.pid, signal.SIGKILL)
         struck += session.wait() == -signal.SIGKILL
 
 
 def fingerprints(config: Config, outputs: Path) -> dict[str, str]:
-    """The hashes of a training that has ended under `outputs`. Raises: Fault."""
+    """Return the hashes of a training that has ended under `outputs`. Raises: Fault."""
     memory = build_memory(config)
     folder = RunFolder(outputs / "runs" / config.run_name())
     state = Checkpoints(folder.checkpoints, config.identity()).load(memory)
     if state is None:
-        raise Fault(f"there is no checkpoint in {folder.path}")
+        raise Fault(f"{folder.path} has no checkpoint")
     return fingerprint(state, memory, folder.path)
 
 
 def _last_line(path: Path) -> str:
-    """How far a session says that it is; empty before it says anything."""
+    """Return the last line of a file, empty if there is none."""
     lines = path.read_text(errors="replace").split("\n") if path.exists() else []
     return next((line.strip() for line in reversed(lines) if line.strip()), "")
 
 
 def generations(outputs: Path, runs: str) -> int:
-    """The generations of all checkpoints of some runs so far."""
+    """Return the number of commits of some runs so far."""
     newest: dict[Path, int] = {}
-    for path in outputs.glob(f"runs/{runs}/checkpoints/0*/manifest.json"):
-        run, generation = path.parents[2], int(path.parent.name)
-        newest[run] = max(newest.get(run, 0), generation)
+    for path in sorted(outputs.glob(f"runs/{runs}/checkpoints/0*/manifest.json")):
+        newest[path.parents[2]] = int(path.parent.name)
     return sum(newest.values())

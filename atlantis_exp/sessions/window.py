@@ -11,10 +11,10 @@ if TYPE_CHECKING:
 
 
 class Window:
-    """A pygame window that shows screens at the game's speed and says which action the keys mean.
+    """A pygame window that shows screens at the game's speed and reads actions from the keys.
 
     Raises:
-        Fault: where pygame is not installed or there is no screen.
+        Fault: pygame or a screen is missing.
     """
 
     def __init__(self, title: str, game: Game, steps_per_second: float, scale: int) -> None:
@@ -28,9 +28,9 @@ class Window:
             self._surface = pygame.display.set_mode((160 * scale, 210 * scale))
         except pygame.error as error:
             raise Fault(f"play needs a screen: {error}") from None
-        # Where it finds no screen SDL draws into memory, unasked.
+        # Without a screen SDL draws into memory, unasked.
         if "SDL_VIDEODRIVER" not in os.environ and pygame.display.get_driver() in ("offscreen", "dummy"):
-            raise Fault("play needs a screen: there is none here")
+            raise Fault("play needs a screen: none was found")
         pygame.display.set_caption(f"{title}: {game.keys_in_words}")
         try:
             self._actions = {  # in the order of precedence
@@ -45,7 +45,7 @@ class Window:
         self.closed = False
 
     def choose(self, screen: "Pixels") -> int:
-        """Show a screen, (210, 160, 3) uint8, for one step; the action of the keys pressed meanwhile or still."""
+        """Show a screen, (210, 160, 3) uint8, for one step; return the action of the keys pressed meanwhile."""
         pygame = self._pygame
         picture = pygame.surfarray.make_surface(screen.swapaxes(0, 1))
         self._surface.blit(pygame.transform.scale(picture, self._surface.get_size()), (0, 0))
@@ -58,5 +58,4 @@ class Window:
         return next((action for key, action in self._actions.items() if key in tapped or held[key]), 0)
 
     def close(self) -> None:
-        """Close the window."""
         self._pygame.display.quit()

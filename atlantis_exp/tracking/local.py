@@ -1,7 +1,4 @@
-"""The local store's own tables, where MLflow's client is too slow or has no call.
-
-They are those of MLflow 3.17, which refuses to open any other.
-"""
+"""Work on the tables of the local store where MLflow's client is too slow or has no call: those of MLflow 3.17."""
 
 import math
 import shutil
@@ -26,7 +23,7 @@ ON CONFLICT (key, run_uuid) DO UPDATE SET
     value = excluded.value, timestamp = excluded.timestamp, step = excluded.step, is_nan = excluded.is_nan
 WHERE (excluded.step, excluded.timestamp, excluded.value) > (step, timestamp, value)
 """
-_PLACES = (  # what names a file by its whole address
+_PLACES = (  # columns with absolute paths
     ("experiments", "artifact_location", "TRUE"),
     ("runs", "artifact_uri", "TRUE"),
     ("logged_models", "artifact_location", "TRUE"),
@@ -35,7 +32,7 @@ _PLACES = (  # what names a file by its whole address
 
 
 def forget_connections(root: Path) -> None:
-    """Close MLflow's connections to a database: they would go on using a file that was moved away."""
+    """Close MLflow's connections to a database: they would keep using a file that was moved."""
     from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
 
     if (engine := SqlAlchemyStore._engine_map.pop(uri_of(root), None)) is not None:
@@ -43,14 +40,14 @@ def forget_connections(root: Path) -> None:
 
 
 def make_database(root: Path) -> None:
-    """Make the database of an outputs folder if there is none, and let it be read while it is written."""
+    """Create the database of an outputs folder if it is missing, and let it be read while it is written."""
     from mlflow import MlflowClient
 
     file = root / DATABASE
     if not file.exists():
         for rest in ("-wal", "-shm"):  # of one that was removed: SQLite would play it into the new one
             file.with_name(DATABASE + rest).unlink(missing_ok=True)
-        # MLflow never recovers from a process that dies while it makes the tables: they are made aside.
+        # MLflow does not recover from a process that dies while it creates the tables: create them aside.
         aside = root / "mlflow.aside"
         shutil.rmtree(aside, ignore_errors=True)
         aside.mkdir()
@@ -58,24 +55,23 @@ def make_database(root: Path) -> None:
         (aside / DATABASE).replace(file)
         shutil.rmtree(aside)
     with closing(sqlite3.connect(file)) as database:
-        database.execute("PRAGMA journal_mode=WAL")  # else one slow reader makes a write fail
+        database.execute("PRAGMA journal_mode=WAL")  # a slow reader would make a write fail
 
 
 def uri_of(root: Path) -> str:
-    """Return the URI of the database of an outputs folder, whatever characters the folder's name has."""
+    """Return the URI of the database of an outputs folder, quoted."""
     from sqlalchemy import URL
 
-    # With the driver's name MLflow makes no folder of the quoted name.
+    # Without the driver's name MLflow would create a folder of the quoted name.
     return URL.create("sqlite+pysqlite", database=str(root / DATABASE)).render_as_string()
 
 
 def artifacts(root: Path, experiment: str) -> Path:
-    """Return the folder of an experiment's files."""
     return root / "artifacts" / experiment
 
 
 def follow(root: Path) -> str | None:
-    """Make the database name its own outputs folder if that was moved or copied; return the folder it named before."""
+    """Update the paths in the database if its outputs folder was moved or copied; return the old folder."""
     moved = None
     with closing(sqlite3.connect(root / DATABASE)) as database, database:
         for name, location in database.execute("SELECT name, artifact_location FROM experiments").fetchall():
@@ -94,7 +90,7 @@ def follow(root: Path) -> str | None:
 
 
 def log_points(root: Path, run_id: str, points: Sequence[Point]) -> None:
-    """Add points to a run, each once however often it is sent; MLflow's client takes a hundred times as long."""
+    """Add points to a run, each once however often it is sent; a hundred times as fast as MLflow's client."""
     rows = [
         (key, 0.0 if math.isnan(value) else value, time, step, math.isnan(value), run_id)
         for key, value, time, step in points

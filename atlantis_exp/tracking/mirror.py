@@ -1,7 +1,7 @@
-"""A run folder's journal as calls of MLflow.
+"""Send a run folder's journal to MLflow.
 
-Sending is at least once and repeatable, hence visible exactly once: the store drops a point that it has already (same
-key, step, time and value), files replace themselves by name, runs and models are looked up before they are made.
+Sending may be repeated, and is visible once: the store drops a point that it has (same key, step, time and value),
+files replace themselves by name, runs and models are looked up before they are made.
 """
 
 import io
@@ -17,9 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from uuid import UUID, uuid5
 
-from pydantic import TypeAdapter
-
-from atlantis_exp.runs.files import ARTIFACT, SMALL, is_whole, read_file, write_file
+from atlantis_exp.runs.files import ARTIFACT, SMALL, is_whole, read_file, schema_of, write_file
 from atlantis_exp.runs.folder import TRACEBACK
 from atlantis_exp.runs.journal import (
     Artifact,
@@ -44,10 +42,10 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 PRIMARY = "published.json"
-"""The file of a run folder that notes how far its own sessions have published it."""
+"""The file of a run folder with its cursor in the store of its own sessions."""
 PLACE = r"([a-z]+)/[A-Za-z0-9][A-Za-z0-9_.,~+=@-]{0,199}"
 """A run folder's place in an outputs folder."""
-_PARENT = rf"\.\./\.\./{PLACE}"  # as a run folder names the one that it is shown under
+_PARENT = rf"\.\./\.\./{PLACE}"  # as a run folder names its parent
 
 _POINTS = 5_000  # to be sent together: fewer cost more each
 _PIXELS = 4_096  # a side, of a picture: a file of some kilobytes can unpack to gigabytes
@@ -66,40 +64,34 @@ class Cursor:
 
     @classmethod
     def read(cls, note: Path) -> "Cursor | None":
-        """Return what was noted; None also if that is damaged, since sending all again is harmless."""
+        """Read a cursor; None also if it is damaged, since sending all again is harmless."""
         try:
-            return _CURSOR.validate_json(read_file(note, SMALL), strict=True)
+            return schema_of(cls).validate_json(read_file(note, SMALL), strict=True)
         except (FileNotFoundError, ValueError):
             return None
 
     def save(self, note: Path) -> None:
-        """Note it in a file."""
         write_file(note, json.dumps(asdict(self)).encode())
-
-
-_CURSOR = TypeAdapter(Cursor)
 
 
 def publish(folder: Path, store: Store, is_primary: bool = True, listed: Collection[str] | None = None) -> bool:
     """Bring the MLflow run of a folder up to the folder's last commit; return whether it was behind.
 
-    A run that has yet to start is left alone. May be repeated, interrupted, and run by several processes at once
-    without doubling anything. How far it came is noted in `published.json`; without that file everything is sent again.
-    Lines are sent in their order, so a step never runs backwards. Infinite values are left out (MLflow would show
-    1.8e308; the journal has them), NaN is kept. A file that is gone is passed over with a warning. A param that changes
-    once MLflow has it, as final there, becomes a tag.
+    May be repeated, interrupted, and run by several processes at once. The cursor is kept in the folder; without it
+    everything is sent again, in order. A run that has not started is skipped. Infinite values are left out (MLflow
+    would show 1.8e308), NaN is kept. A missing file is skipped with a warning. A param that changes becomes a tag:
+    MLflow's params are final.
 
     Args:
-        is_primary: whether this becomes the store that `unfinished` asks for; False leaves that to the one that is, if
-            any, and notes in a file of its own how far it came.
-        listed: the ids of the store's runs, if they were asked for; a folder whose run is not among them is sent anew.
+        is_primary: makes this the store that `unfinished` asks for; False leaves that to another one, if any.
+        listed: the ids of the store's runs, if known; a folder whose run is not among them is sent anew.
 
     Raises:
-        ValueError: on a damaged journal, or a folder that is a link.
-        MlflowException, OSError, sqlite3.Error: if MLflow cannot be reached; what is missing stays to be published.
+        ValueError: the journal is damaged, or the folder is a link.
+        MlflowException, OSError, sqlite3.Error: MLflow cannot be reached; a later call sends the rest.
     """
     if folder.is_symlink():
-        raise ValueError(f"{folder} is a link, behind which nothing is written")
+        raise ValueError(f"{folder} is a link, which is not written through")
     folder = folder.resolve()
     note = _note(folder, store, is_primary)
     with alone(note.with_suffix(".lock")):
@@ -133,17 +125,16 @@ def _publish(folder: Path, store: Store, commit: Commit, note: Path, cursor: Cur
 
 
 def digest(commit: Commit) -> str:
-    """Return a hash of a commit, to be compared."""
     return sha256(commit_bytes(commit)).hexdigest()
 
 
 def noted(folder: Path) -> list[Cursor]:
-    """Return how far a folder is published in each store."""
+    """Return a folder's cursors in all stores."""
     return [cursor for note in folder.glob("published*.json") if (cursor := Cursor.read(note))]
 
 
 def _note(folder: Path, store: Store, is_primary: bool) -> Path:
-    """The file that says how far a folder is published in a store."""
+    """Return the file with a folder's cursor in a store."""
     primary = Cursor.read(folder / PRIMARY)
     if is_primary or primary is None or primary.store == store.address:
         return folder / PRIMARY
@@ -151,17 +142,17 @@ def _note(folder: Path, store: Store, is_primary: bool) -> Path:
 
 
 def _opened(cursor: Cursor | None, note: Path, folder: Path, store: Store, commit: Commit) -> "tuple[Cursor, Run]":
-    """Return the cursor of a folder in a store and its run, at the start of a found or new run if there was none."""
+    """Return a folder's cursor in a store and its run; a new cursor is at the start of a found or new run."""
     run = store.run(cursor.run_id) if cursor and cursor.store == store.address and cursor.run_id else None
     if cursor and run:
         if cursor.identity == commit.identity == run.data.tags.get(IDENTITY):
             return cursor, run
-        # Of another folder it would be somebody else's, named by a note that was copied or made up.
+        # A run of another folder is not ours: its cursor was copied or forged.
         is_own = (run.data.tags.get(IDENTITY), run.data.tags.get(FOLDER)) == (cursor.identity, str(folder))
         if is_own and cursor.identity != commit.identity:
             store.delete_run(cursor.run_id)  # it shows lines that the journal has taken back
     cursor = Cursor(store.address, commit.identity)
-    cursor.save(note)  # should MLflow be out of reach, `unfinished` tells others where it is to go
+    cursor.save(note)  # for `unfinished`, if MLflow is out of reach
     run = store.open_run(folder, commit)
     cursor = replace(cursor, run_id=run.info.run_id)
     cursor.save(note)
@@ -169,7 +160,7 @@ def _opened(cursor: Cursor | None, note: Path, folder: Path, store: Store, commi
 
 
 def _parent_run(folder: Path, store: Store, commit: Commit, is_primary: bool) -> str | None:
-    """The run that a folder's is shown under, which is published if it is not yet there."""
+    """Publish a folder's parent if need be, and return its run."""
     _check_parents(folder, commit.parent)
     parent = Path(os.path.normpath(folder / commit.parent))
     if not re.fullmatch(_PARENT, commit.parent) or parent.is_symlink() or not parent.exists():
@@ -180,7 +171,7 @@ def _parent_run(folder: Path, store: Store, commit: Commit, is_primary: bool) ->
 
 
 def _check_parents(folder: Path, parent: str) -> None:
-    """Refuse a parent that is shown under the folder itself, or under itself. Raises: ValueError."""
+    """Raise ValueError for a circle of parents."""
     places = [Path(os.path.normpath(folder))]
     while re.fullmatch(_PARENT, parent):
         place = Path(os.path.normpath(places[-1] / parent))
@@ -192,10 +183,7 @@ def _check_parents(folder: Path, parent: str) -> None:
 
 
 class _Mirror:
-    """Sends records of one folder to one run; every method may be repeated.
-
-    Points and tags, which are many, wait for `flush`.
-    """
+    """Sends records of one folder to one run; every method may be repeated. Points and tags wait for `flush`."""
 
     def __init__(self, folder: Path, store: Store, run: "Run") -> None:
         self._folder = folder
@@ -253,7 +241,7 @@ class _Mirror:
                     self._send_model(record, content)
 
     def _content(self, record: Artifact | Image | Model) -> bytes | None:
-        """The file that a record names, None if it is gone or another."""
+        """Return the file that a record names, None if it is missing or has another checksum."""
         file = self._folder / "artifacts" / record.path
         if not file.is_file():
             self.gone.append(record.path)
@@ -261,8 +249,8 @@ class _Mirror:
         content = read_file(file, ARTIFACT)
         if isinstance(record, Image) or is_whole(content, record.sha256):
             return content
-        if isinstance(record, Model):  # else it is newer than this record, and has, or will have, one of its own
-            _log.warning("%s is not what was recorded and is not published", file)
+        if isinstance(record, Model):  # another file is newer than this record, and has its own
+            _log.warning("%s has changed since it was recorded and is not published", file)
         return None
 
     def _send_params(self, values: dict[str, str]) -> None:
@@ -275,12 +263,13 @@ class _Mirror:
         self._tags |= {key: value for key, value in values.items() if self._final[key] != value}
 
     def _send_image(self, record: Image, content: bytes) -> None:
-        # `log_image` with a key would name the files at random, so that an image sent again would be a second one.
-        name = _image_name(self._run_id, record)
+        # Named as MLflow's pages expect, where `log_image` would give an image sent again another name.
+        unique = uuid5(UUID(self._run_id), record.path)
+        name = f"images/{record.key.replace('/', '~')}+step+{record.step}+timestamp+{record.time}+{unique}"
         try:
             small = _shrunk(content)
         except Exception as error:  # PIL raises anything
-            raise ValueError(f"{self._folder / 'artifacts' / record.path} is no PNG of a run: {error}") from None
+            raise ValueError(f"{self._folder / 'artifacts' / record.path} is not a PNG of a run: {error}") from None
         self._store.put(self._run_id, f"{name}.png", content)
         self._store.put(self._run_id, f"{name}+compressed.webp", small)
         self._tags["mlflow.loggedImages"] = "True"
@@ -291,7 +280,7 @@ class _Mirror:
         experiment = self._store.experiment_id
         same = f"source_run_id = '{self._run_id}' AND tags.step = '{record.step}'"
         found = self._client.search_logged_models([experiment], same, max_results=1)
-        name = re.sub("[/:.%\"']", "-", f"{self._run.info.run_name} {record.step}")  # MLflow takes these in no model's
+        name = re.sub("[/:.%\"']", "-", f"{self._run.info.run_name} {record.step}")  # MLflow refuses these
         create = self._client.create_logged_model
         model = found[0] if found else create(experiment, name, self._run_id, {"step": str(record.step)})
         model_id = model.model_id
@@ -315,7 +304,7 @@ def _points(record: Metrics | Model) -> list[Point]:
 
 
 def _shrunk(content: bytes) -> bytes:
-    """A PNG, the only format that is tried, as small as MLflow's pages show it at first, as WebP."""
+    """Return a PNG as a WebP of the size of MLflow's previews."""
     from mlflow.tracking.multimedia import compress_image_size
     from PIL.PngImagePlugin import PngImageFile
 
@@ -325,9 +314,3 @@ def _shrunk(content: bytes) -> bytes:
             raise ValueError(f"{image.width:,} x {image.height:,} pixels, more than {_PIXELS:,} a side")
         compress_image_size(image).save(small, "WEBP")
     return small.getvalue()
-
-
-def _image_name(run_id: str, record: Image) -> str:
-    """The path of an image among its run's artifacts, without its ending, as MLflow's pages look for it."""
-    unique = uuid5(UUID(run_id), record.path)
-    return f"images/{record.key.replace('/', '~')}+step+{record.step}+timestamp+{record.time}+{unique}"

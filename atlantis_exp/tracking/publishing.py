@@ -1,4 +1,4 @@
-"""Run folders and the store while a command works: mirrored as they grow, and what earlier commands left is sent."""
+"""Mirror run folders to the store while a command works, and send the rest of earlier commands."""
 
 import logging
 import os
@@ -22,13 +22,13 @@ from atlantis_exp.tracking.store import Store, first_line
 
 _log = logging.getLogger(__name__)
 
-_DRAIN_SECONDS = 20.0  # that a command waits for MLflow at its end; `catch_up` sends what is missing then
+_DRAIN_SECONDS = 20.0  # that a command waits for MLflow at its end; `catch_up` sends the rest later
 
 
 class Publisher:
-    """A thread that keeps MLflow up to date with a run folder's commits, and with others', and never disturbs the runs.
+    """A thread that publishes the commits of run folders every `interval` seconds, and never disturbs the runs.
 
-    It looks at the folders every `interval` seconds; while MLflow fails, less and less often, down to once a minute.
+    While MLflow fails it tries less and less often, down to once a minute.
     """
 
     def __init__(self, folder: Path, store: Store, interval: float = 5.0, others: Sequence[Path] = ()) -> None:
@@ -40,10 +40,7 @@ class Publisher:
         self._thread.start()
 
     def drain(self, timeout: float) -> bool:
-        """Publish what is committed by now and stop; return False if that took more than `timeout` seconds.
-
-        What is left then is published while the process lives, and by `publish` later.
-        """
+        """Publish the commits so far and stop; return False if that takes more than `timeout` seconds."""
         self._draining.set()
         self._thread.join(timeout)
         return not self._thread.is_alive()
@@ -51,8 +48,8 @@ class Publisher:
     def _run(self) -> None:
         delay, failing, told = self._interval, False, set[Path]()
         while True:
-            draining = self._draining.is_set()  # asked first: what is committed before a drain is published by it
-            fault: Exception | None = None  # of the store; a folder's own is no reason to skip the others, or to wait
+            draining = self._draining.is_set()  # read first: commits before a drain are published by it
+            fault: Exception | None = None  # of the store; a folder's own fault does not stop the others
             for folder in self._folders:
                 try:
                     publish(folder, self._store)
@@ -89,14 +86,14 @@ def publishing(
     others: Sequence[RunFolder] = (),
     seconds: float = _DRAIN_SECONDS,
 ) -> Iterator[Journal]:
-    """Open a journal in the run's folder and mirror it to MLflow while it grows (tracking=mlflow).
+    """Open a journal in the run's folder and mirror it to MLflow while it grows, unless tracking=none.
 
-    labels: tags that the run bears from its first moment.
-    others: runs that other processes write and that are mirrored too.
+    labels: tags that the run has from the start.
+    others: runs of other processes, mirrored too.
     seconds: to wait for MLflow at the end.
 
     Raises:
-        JournalError: if the folder's journal is damaged.
+        JournalError: the folder's journal is damaged.
     """
     journal = Journal(folder.path, labels)
     if tracking.name == "none":
@@ -114,7 +111,7 @@ def publishing(
 
 
 def unfinished(folder: Path, root: Path) -> Store | None:
-    """Return the store, with its files under `root`, that lacks a part of what a published folder has committed."""
+    """Return the store, with its files under `root`, that lacks committed parts of a published folder."""
     cursor, commit = Cursor.read(folder / PRIMARY), read_commit(folder)
     if cursor is None or commit is None or cursor.commit == digest(commit):
         return None
@@ -125,11 +122,10 @@ def unfinished(folder: Path, root: Path) -> Store | None:
 def catch_up(
     outputs: Path, server: str | None = None, continued: Path | None = None, seconds: float = _DRAIN_SECONDS
 ) -> None:
-    """Mark runs whose process died as interrupted; publish what earlier commands could not, each for some seconds.
+    """Mark runs whose process died as interrupted; publish the rest of earlier commands, each for some seconds.
 
-    A folder's word for a server is not enough, since it would be sent the user's password: only the command's own
-    `server` is sent to, and the one that MLFLOW_TRACKING_URI names. Not published is the run in the folder `continued`,
-    whose own session will do so.
+    A folder may name any server, which would be sent the user's password: only the command's own `server` is used, and
+    the one in MLFLOW_TRACKING_URI. The run in the folder `continued` is left to its own session.
     """
     named = {server, os.environ.get("MLFLOW_TRACKING_URI")}
     left: Counter[str] = Counter()
@@ -137,14 +133,14 @@ def catch_up(
     for folder in all_folders(outputs):
         try:
             if folder.status == "RUNNING" and not folder.is_held:
-                with suppress(Fault, OSError), folder.held():  # a folder of somebody else's may be read alone
-                    if folder.status == "RUNNING":  # its process may just have ended it
+                with suppress(Fault, OSError), folder.held():  # another user's folder may be read-only
+                    if folder.status == "RUNNING":  # it may just have ended
                         Journal(folder.path).status("KILLED")
                         print(f"run {folder.name} was killed; the command that started it continues it")
             is_sent = folder.status == "RUNNING" or folder.path == continued
             store = None if is_sent else unfinished(folder.path, outputs)
         except (Fault, OSError, ValueError) as error:
-            terminal.warn(str(error))  # no reason to refuse a command for another run
+            terminal.warn(str(error))  # but do not refuse a command for another run
             continue
         if store is None or store.address in unreachable:
             continue
@@ -159,7 +155,7 @@ def catch_up(
 
 
 def lacking(outputs: Path) -> list[RunFolder]:
-    """Return the folders that were never published in the local store, all if it is gone."""
+    """Return the folders that were never published in the local store, all if it is missing."""
     folders = [folder for folder in all_folders(outputs) if (folder.path / "journal.jsonl").exists()]
     if not (outputs / DATABASE).exists():
         return folders
@@ -168,7 +164,7 @@ def lacking(outputs: Path) -> list[RunFolder]:
 
 
 def how_to_open(outputs: Path) -> str:
-    """Return a paragraph that says how to open the UI on the store of an outputs folder, empty if there is no run."""
+    """Return a paragraph with the command that opens the UI on an outputs folder, empty if it has no runs."""
     missing = len(lacking(outputs))
     if not missing and not (outputs / DATABASE).exists():
         return ""

@@ -1,4 +1,4 @@
-"""Limits on an MLflow server: a call that takes too long ends, whatever the server does to keep it waiting."""
+"""Time limits on the calls of an MLflow server."""
 
 import os
 import signal
@@ -18,7 +18,7 @@ class TooSlow(Exception):
 
 
 class PatientClient:
-    """An MLflow client whose calls raise TooSlow after some seconds, and one more for each 64 KiB of a sent file."""
+    """An MLflow client whose calls raise TooSlow after some seconds, plus one for each 64 KiB of a sent file."""
 
     def __init__(self, client: "MlflowClient", seconds: int) -> None:
         self._client, self._seconds = client, seconds
@@ -36,7 +36,7 @@ class PatientClient:
 
 @contextmanager
 def _patience(seconds: int) -> Iterator[None]:
-    """Raise TooSlow if the block takes longer. In other threads than the main one no signal can end a wait."""
+    """Raise TooSlow if the block takes longer; in the main thread only, as only there a signal can end a wait."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -51,7 +51,7 @@ def _patience(seconds: int) -> Iterator[None]:
     try:
         yield
     except Exception:
-        if late:  # MLflow wraps it
+        if late:  # MLflow has wrapped it
             raise late[0] from None
         raise
     finally:

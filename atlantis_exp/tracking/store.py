@@ -30,7 +30,7 @@ P = TypeVar("P")
 _log = logging.getLogger(__name__)
 
 IDENTITY, FOLDER, RUN_NAME = "atlantis.identity", "atlantis.folder", "mlflow.runName"
-"""Tags of a run: which one it is, from which folder it was published, and its name."""
+"""Tags of a run: its identity, the folder that it was published from, and its name."""
 
 _PAGES = 1_000  # of 1,000 runs each, that a server may list
 _NAME_LENGTH = 250  # characters of a run's name that a PostgreSQL store takes
@@ -40,14 +40,13 @@ _UNUSABLE = ("not a database", "is malformed", "out-of-date database schema", "C
 class Store:
     """One experiment of an MLflow database under `root`, a folder on a local disk, or of the server at `tracking_uri`.
 
-    Constructing one does nothing: MLflow is imported (1-3 s) and its tables are made on first use, which any number of
-    processes may come to at once.
+    MLflow is imported (1-3 s) and its tables are made on first use, by any number of processes at once. patience:
+    seconds that a call of a server may take.
     """
 
     def __init__(
         self, root: Path, experiment: str = "atlantis", tracking_uri: str | None = None, patience: int = 60
     ) -> None:
-        """patience: seconds that a server may take for a call."""
         self._root = root.resolve()
         self._experiment = experiment
         self._patience = patience
@@ -56,7 +55,6 @@ class Store:
 
     @property
     def client(self) -> "MlflowClient":
-        """MLflow's own client."""
         return self._connection[0]
 
     @property
@@ -66,22 +64,21 @@ class Store:
 
     @property
     def address(self) -> str:
-        """What tells this experiment from any other, in this database or elsewhere."""
+        """The database or server, and the experiment."""
         return f"{self.uri}#{self._experiment}"
 
     def runs(self, name: str | None = None) -> "list[Run]":
-        """Return the runs that were published here, the latest first; given a name, those that bear it."""
+        """Return the published runs, the latest first; with a name, those of that name."""
         published = f"tags.`{FOLDER}` != ''"
         wanted = published if name is None else f'{published} AND attributes.run_name = "{name}"'
         return all_pages(partial(self.client.search_runs, [self.experiment_id], wanted))
 
     def models(self, run_id: str) -> "list[LoggedModel]":
-        """Return the models of a run."""
         same = f"source_run_id = '{run_id}'"
         return all_pages(partial(self.client.search_logged_models, [self.experiment_id], same))
 
     def prepare(self) -> None:
-        """Make the experiment explain itself and seed its shared views, see `views`."""
+        """Write the experiment's description and shared views."""
         newest = next((run for run in self.runs() if run.data.tags.get("atlantis.kind") == "comparison"), None)
         place = f"#/experiments/{self.experiment_id}/runs"
         linked = f"[{newest.info.run_name}]({place}/{newest.info.run_id})" if newest else None
@@ -89,7 +86,7 @@ class Store:
             self.client.set_experiment_tag(self.experiment_id, key, value)
 
     def open_run(self, folder: Path, commit: Commit) -> "Run":
-        """Return the run that mirrors a folder; make it if it is not there."""
+        """Return the run that mirrors a folder; create it if it is missing."""
         same = f"tags.`{IDENTITY}` = '{commit.identity}'"
         if found := self.client.search_runs([self.experiment_id], same, max_results=1):
             return found[0]
@@ -98,7 +95,7 @@ class Store:
         return self.client.create_run(self.experiment_id, commit.started, tags, labels.get(RUN_NAME, folder.name))
 
     def run(self, run_id: str) -> "Run | None":
-        """Return a run, None if it is not there or was deleted."""
+        """Return a run, None if it is missing or deleted."""
         from mlflow.exceptions import MlflowException
 
         try:
@@ -116,12 +113,12 @@ class Store:
         self.client.delete_run(run_id)
 
     def put(self, run_id: str, path: str, content: bytes, model_id: str = "") -> None:
-        """Put a file among those of a run or, given its id, of a model."""
-        if self.is_local:  # MLflow's client asks the database about each
+        """Add a file to a run or to a model."""
+        if self.is_local:  # MLflow's client would ask the database for each
             owner = f"models/{model_id}" if model_id else run_id
             place = local.artifacts(self._root, self._experiment) / owner / "artifacts" / path
             place.parent.mkdir(parents=True, exist_ok=True)
-            place.unlink(missing_ok=True)  # it may be linked from a copy of the outputs folder
+            place.unlink(missing_ok=True)  # a copy of the outputs folder may share it as a hard link
             place.write_bytes(content)
             return
         with TemporaryDirectory() as aside:
@@ -142,7 +139,7 @@ class Store:
         self.client.log_batch(run_id, metrics=[Metric(*point) for point in points], synchronous=True)
 
     def fault(self, error: Exception) -> Fault | None:
-        """Return the store's fault after an error, None if it answers: then the folder being published is to blame."""
+        """Return the store's fault after an error, None if it answers and the published folder is the cause."""
         if isinstance(error, ValueError):  # raised for a folder's own files
             return None
         is_busy = getattr(error, "error_code", "") == "TEMPORARILY_UNAVAILABLE"
@@ -170,7 +167,7 @@ class Store:
     @cached_property
     def _connection(self) -> tuple["MlflowClient", str]:
         os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-        os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")  # the default holds a call for 246 s
+        os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")  # by default a call may take 246 s
         os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")  # seconds
         os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
         os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
@@ -178,10 +175,10 @@ class Store:
         os.environ.setdefault("MLFLOW_ENABLE_PROXY_MULTIPART_UPLOAD", "false")
         from mlflow import MlflowClient
 
-        # Whatever fails in MLflow reaches us as an exception; its log would add a traceback to each.
+        # MLflow's failures reach us as exceptions; its log would add a traceback to each.
         logging.getLogger("mlflow").setLevel(logging.CRITICAL)
         logging.getLogger("alembic").setLevel(logging.WARNING)
-        with alone(self._root / "mlflow.lock"):  # processes that make the tables together break them for good
+        with alone(self._root / "mlflow.lock"):  # processes that create the tables together would break them
             if not self.is_local:
                 client = cast("MlflowClient", PatientClient(MlflowClient(self.uri), self._patience))
                 return client, self._opened_experiment(client)
@@ -197,9 +194,9 @@ class Store:
                 raise self.explained(error) from None
 
     def _opened_experiment(self, client: "MlflowClient") -> str:
-        """The id of the experiment, which is made, or restored if it was deleted."""
+        """Return the id of the experiment; create it if it is missing, restore it if it was deleted."""
         if (experiment := client.get_experiment_by_name(self._experiment)) is None:
-            # MLflow's own choice would depend on the working directory of the first process.
+            # MLflow's default depends on the working directory of the first process.
             location = local.artifacts(self._root, self._experiment).as_uri() if self.is_local else None
             try:
                 return client.create_experiment(self._experiment, location)
@@ -213,18 +210,18 @@ class Store:
 
 
 def labels_of(commit: Commit) -> dict[str, str]:
-    """Return the tags that a run is shown by, its name no longer than a store takes."""
+    """Return a run's labels, its name cut to the length that a store takes."""
     return {key: text[:_NAME_LENGTH] if key == RUN_NAME else text for key, text in commit.labels.items()}
 
 
 def first_line(error: Exception) -> str:
-    """Return what went wrong, in a line."""
+    """Return an error's first line."""
     text = str(error) if isinstance(error, Fault) else f"{type(error).__name__}: {error}"
     return terminal.harmless(text.partition("\n")[0])
 
 
 def all_pages(search: "Callable[..., PagedList[P]]") -> list[P]:
-    """Return all that a search finds. Raises: ValueError if its pages do not end."""
+    """Return all results of a search. Raises: ValueError for too many pages."""
     found: list[P] = []
     token: str | None = None
     for _ in range(_PAGES):

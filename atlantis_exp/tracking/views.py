@@ -1,6 +1,6 @@
-"""Prepared pages of the MLflow UI: what a person sees first.
+"""Prepare the first pages of the MLflow UI.
 
-A shared view is a tag of the experiment in a format that MLflow keeps to itself (3.17); a test opens them in a browser.
+A shared view is a tag of the experiment in an internal format of MLflow 3.17; a test opens them in a browser.
 """
 
 import base64
@@ -31,7 +31,7 @@ START, SWEEP, COMPARISONS = "start", "sweep", "comparisons"
 """The keys of the shared views, as `viewStateShareKey` in an address takes them."""
 
 _NO_PLAYERS = ("training sweep", "search", "decision", "comparison", "verification")
-"""Kinds of runs that played no game of their own."""
+"""Kinds of runs without a game of their own."""
 
 _ABOUT = """\
 **Does network B play better than network A, and how sure is that?**
@@ -52,7 +52,7 @@ _ABOUT = """\
 
 
 def experiment_tags(newest: str | None) -> dict[str, str]:
-    """The tags of an experiment that explain it and prepare its views; newest: a link to its newest comparison."""
+    """Return an experiment's tags: description and views; newest: a link to its newest comparison."""
     note = f"{_ABOUT}- The newest comparison: {newest}\n" if newest else _ABOUT
     tags = {NOTE: note, "mlflow.experimentKind": "custom_model_development"}
     views = {
@@ -68,7 +68,7 @@ def experiment_tags(newest: str | None) -> dict[str, str]:
 
 
 def address(server: str, experiment_id: str, view: str) -> str:
-    """What opens a view of an experiment on a server."""
+    """Return the address of a view of an experiment on a server."""
     mode = "TABLE" if view == COMPARISONS else "CHART"
     return (
         f"{server}/#/experiments/{experiment_id}/runs?workflowType=machine_learning&compareRunsMode={mode}"
@@ -85,7 +85,7 @@ def site(outputs: Path, start: str) -> Any:
     with warnings.catch_warnings(action="ignore"):  # of a library that MLflow will replace
         from mlflow.server.fastapi_app import app
 
-    # What is behind '#' is not sent to a server: the page itself has to look.
+    # Browsers do not send the part after '#' to a server: the page itself has to look.
     lead = f"<head><script>if (!location.hash) location.replace({json.dumps(start)})</script>"
     index = Path(str(pages.static_folder), "index.html").read_text().replace("<head>", lead, 1)
     pages.view_functions["serve"] = lambda: index
@@ -147,17 +147,9 @@ def _verdicts() -> dict[str, Any]:
 
 
 def _page(view: str, charts: list[dict[str, Any]]) -> dict[str, Any]:
+    shown = {"display": True, "isReordered": True, "deleted": False, "isGenerated": False}
     sections = [
-        {
-            "uuid": name,
-            "name": name,
-            "columns": columns,
-            "cardHeight": height,
-            "display": True,
-            "isReordered": True,
-            "deleted": False,
-            "isGenerated": False,
-        }
+        {"uuid": name, "name": name, "columns": columns, "cardHeight": height, **shown}
         for name, (columns, height) in _SECTIONS.items()
     ]
     # A picture that no chart shows alone would get one that does; a deleted one prevents it.

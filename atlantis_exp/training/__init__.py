@@ -1,5 +1,5 @@
-"""The training loop, and what evaluates, records and continues it.
+"""The training loop, and its evaluation, records and checkpoints.
 
-In: built emulators, actor, memory and learner. Out: a journal, checkpoints, an outcome. The only wing that has seen
-game, replay and learning together. It must not know config, Hydra or MLflow.
+In: built emulators, actor, memory and learner. Out: a journal, checkpoints, an outcome. The only package that combines
+game, replay and learning. It must not know config, Hydra or MLflow.
 """

@@ -12,11 +12,11 @@ States = npt.NDArray[np.uint8]  # (B, stack, size, size)
 
 
 class Decisions(NamedTuple):
-    """One action a state, whether chance chose it (the decision source) rather than the network, and what was known."""
+    """One action a state, whether chance chose it (the decision source), and the network's values if known."""
 
     actions: npt.NDArray[np.int64]  # (B,)
     random: npt.NDArray[np.bool_]  # (B,)
-    values: npt.NDArray[np.float32] | None = None  # (B, actions), the network's, where it was asked for all
+    values: npt.NDArray[np.float32] | None = None  # (B, actions)
 
 
 class Actor(Protocol):
@@ -29,7 +29,7 @@ class Actor(Protocol):
 class EpsilonGreedy:
     """The network's best action, or with probability epsilon any action (report figure 3.2).
 
-    The network is asked only where chance does not choose, unless `watches`: then the decisions hold its values.
+    Chance decides before the network is asked, unless `watches`: then the decisions hold its values of all states.
     """
 
     q_values: Callable[[States], npt.NDArray[np.float32]]
@@ -63,7 +63,7 @@ class RandomActor:
 
 @dataclass(frozen=True)
 class PersonActor:
-    """Whoever `choose`s an action at the sight of the one emulator's screen, (210, 160, 3) uint8."""
+    """A person who `choose`s an action at the sight of the one emulator's screen, (210, 160, 3) uint8."""
 
     screen: Callable[[], npt.NDArray[np.uint8]]
     choose: Callable[[npt.NDArray[np.uint8]], int]

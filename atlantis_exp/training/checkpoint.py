@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import safetensors.numpy
@@ -21,39 +21,35 @@ from atlantis_exp.runs.files import CHECKPOINT, SMALL, inside, read_file, read_o
 
 FORMAT = 1
 _SEGMENTS = 64  # of a full memory, about
-_DAMAGED = (
-    *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
-    SafetensorError,
-)
-"""What comes of a state that is not what was saved."""
+_DAMAGED = (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, SafetensorError)
+"""Errors of reading a state that is not the one saved."""
 _FOR_GOOD = {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENXIO, errno.EIO}
-"""Why a file that was saved is not there any more; any other reason may pass, as a file server's."""
+"""Errors of a file that is lost; others may pass, as those of a file server."""
 
 
 class CheckpointError(Fault):
-    """No checkpoint that could be continued from, although there is one; says which and why."""
+    """No checkpoint can be continued from, although there is one."""
 
 
 @contextmanager
 def unforged(folder: Path) -> Iterator[None]:
-    """Take a state apart in the block. Raises: CheckpointError where it holds something else than was saved."""
+    """Raise CheckpointError if the block, which takes a state apart, finds another state than was saved."""
     try:
         yield
     except Fault:
         raise
     except (*_DAMAGED, MemoryError) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise CheckpointError(f"the checkpoint in {folder} is none of this training ({reason})") from None
+        raise CheckpointError(f"the checkpoint in {folder} is not of this training ({reason})") from None
 
 
 def to_safetensors(tensors: Mapping[str, torch.Tensor]) -> bytes:
-    """Tensors by name as safetensors, which refuses what shares memory: of tied weights each is written."""
+    """Return tensors by name as safetensors, which refuses shared memory: tied weights are written twice."""
     written: dict[str, torch.Tensor] = {}
     places: set[int] = set()
     for name, tensor in tensors.items():
         place = tensor.untyped_storage().data_ptr()
-        apart = tensor.detach().clone() if place in places else tensor.detach()
-        written[name] = apart.contiguous()
+        written[name] = (tensor.detach().clone() if place in places else tensor.detach()).contiguous()
         places.add(place)
     return safetensors.torch.save(written)
 
@@ -62,10 +58,9 @@ class Checkpoints:
     """Generations of a training's state under a folder; the two newest are kept.
 
     A generation is a folder with `state.json` (the tree, with a place for each array), `tensors.safetensors` and
-    `arrays.safetensors`. The replay memory is kept apart, in segments that never change and are shared: a save adds
-    only what came since the last one, and a small last segment once more. A generation counts from the moment its
-    `manifest.json`, which holds the checksum of every file and its own, is in place. `identity` is the experiment that
-    the state belongs to.
+    `arrays.safetensors`. It counts once its `manifest.json` is in place, with the checksums of all files and its own.
+    Generations share the segments of the replay memory, which never change: a save adds the new observations, and
+    writes a small last segment again. `identity` names the experiment.
     """
 
     def __init__(self, folder: Path, identity: str) -> None:
@@ -73,7 +68,7 @@ class Checkpoints:
         self.identity = identity
         self._segments: list[dict[str, Any]] = []  # of the memory, oldest first: name, since, next_id, sha256
         self._generation = 0
-        self.lost = 0  # observations that the memory which was loaded should have, at most
+        self.lost = 0  # observations missing from the loaded memory, at most
 
     def save(self, state: Mapping[str, Any], memory: ReplayMemory) -> None:
         """Write a generation. Raises: OSError, with the generations before it intact."""
@@ -81,13 +76,12 @@ class Checkpoints:
         since = segments[-1]["next_id"] if segments else memory.oldest_id
         if memory.next_id > since:
             if segments and since - segments[-1]["since"] < memory.capacity // _SEGMENTS:
-                since = segments.pop()["since"]  # again, with what is new: frequent saves would make tiny segments
+                since = segments.pop()["since"]  # write it again: frequent saves would make tiny segments
             name = f"segments/{since:012d}-{memory.next_id:012d}"
             checksums = self._write(name, memory.segment(since))
             segments.append({"name": name, "since": since, "next_id": memory.next_id, "sha256": checksums})
         generation = self._generation + 1
-        # What a crash left here is not covered by a manifest.
-        shutil.rmtree(self.folder / _name(generation), ignore_errors=True)
+        shutil.rmtree(self.folder / _name(generation), ignore_errors=True)  # left by a crash, without a manifest
         manifest = {
             "format": FORMAT,
             "identity": self.identity,
@@ -102,15 +96,14 @@ class Checkpoints:
     def load(
         self, memory: ReplayMemory | None = None, warn: Callable[[str], None] = lambda _: None
     ) -> dict[str, Any] | None:
-        """The newest whole generation's state; None where nothing was ever saved. Restores `memory` if there is one.
+        """Return the newest whole generation's state, None if there is none; restore `memory` if given.
 
-        A damaged generation is passed over with a call of `warn`, which gets one line. Where none has its whole memory,
-        since generations share segments, the newest goes on with the observations behind the last damaged segment;
-        `lost` says how many that costs.
+        A damaged generation is skipped with a `warn`ing. If none has its whole memory, the newest goes on with the
+        observations after the last damaged segment, and `lost` counts the others.
 
         Raises:
-            CheckpointError: if all generations are damaged, the newest is of another experiment or a newer format, or
-                a file may be whole but cannot be read now; on disk all stays as it is.
+            CheckpointError: all generations are damaged, the newest is of another experiment or a newer format, or a
+                file cannot be read now but may be whole. The files stay as they are.
         """
         faults: list[str] = []
         state = self._load(memory, False, faults)
@@ -121,12 +114,10 @@ class Checkpoints:
         if memory is not None and (state := self._load(memory, True, [])) is not None:
             warn(f"no checkpoint has its whole replay memory: {self.lost:,} observations are lost, the run goes on")
             return state
-        raise CheckpointError(
-            f"{faults[0]}, and no older one is whole; resume=never keeps what is there and begins anew"
-        )
+        raise CheckpointError(f"{faults[0]}, and no older one is whole; resume=never keeps this run and begins anew")
 
     def _load(self, memory: ReplayMemory | None, may_lose: bool, faults: list[str]) -> dict[str, Any] | None:
-        """The newest generation's state that can be read, with the faults of those that cannot."""
+        """Return the newest state that can be read; append the faults of those that cannot."""
         for generation in sorted(self._generations(), reverse=True):
             try:
                 manifest = read_object(self._content(f"{_name(generation)}/manifest.json", SMALL))
@@ -153,19 +144,16 @@ class Checkpoints:
         return None
 
     def _load_what_is_left(self, memory: ReplayMemory, segments: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Restore the segments behind the last damaged one, and return them."""
+        """Restore and return the segments after the last damaged one."""
         whole: list[dict[str, Any]] = []
         contents: list[dict[str, Any]] = []
         try:
             for entry in reversed(segments):
                 contents.insert(0, self._read(entry["name"], entry["sha256"]))
                 whole.insert(0, entry)
-        except CheckpointError:  # a RuntimeError, too
-            raise
-        except _DAMAGED:
-            pass
-        if not segments:
-            raise ValueError("it has no segment of the replay memory")
+        except _DAMAGED as error:
+            if isinstance(error, CheckpointError):  # a RuntimeError, too
+                raise
         oldest_id, next_id = int(segments[0]["since"]), int(segments[-1]["next_id"])
         memory.load_newest(contents, next_id)
         self.lost = memory.oldest_id - max(oldest_id, next_id - memory.capacity)
@@ -188,7 +176,7 @@ class Checkpoints:
         return [int(path.parent.name) for path in folders if path.parent.name.isdecimal()]
 
     def _write(self, name: str, tree: Mapping[str, Any]) -> dict[str, str]:
-        """Write a state tree as files of a new folder; returns their checksums."""
+        """Write a state tree as files of a new folder; return their checksums."""
         tensors: dict[str, torch.Tensor] = {}
         arrays: dict[str, np.ndarray[Any, Any]] = {}
         files = {"state.json": json.dumps(_disassemble(tree, "", tensors, arrays)).encode()}
@@ -201,19 +189,16 @@ class Checkpoints:
         return {file: hashlib.sha256(content).hexdigest() for file, content in files.items()}
 
     def _read(self, name: str, checksums: Mapping[str, str]) -> dict[str, Any]:
-        if not set(checksums) <= {"state.json", "tensors.safetensors", "arrays.safetensors"}:
-            raise ValueError("its manifest names files that no checkpoint has")
         contents = {file: self._content(f"{name}/{file}", CHECKPOINT) for file in checksums}
         for file, content in contents.items():
             if hashlib.sha256(content).hexdigest() != checksums[file]:
                 raise ValueError(f"{name}/{file} does not have its checksum")
         tensors = safetensors.torch.load(contents["tensors.safetensors"]) if "tensors.safetensors" in contents else {}
         arrays = safetensors.numpy.load(contents["arrays.safetensors"]) if "arrays.safetensors" in contents else {}
-        tree: dict[str, Any] = _assemble(read_object(contents["state.json"]), tensors, arrays)
-        return tree
+        return cast(dict[str, Any], _assemble(read_object(contents["state.json"]), tensors, arrays))
 
     def _content(self, name: str, most: int) -> bytes:
-        """A file's bytes. Raises: CheckpointError where it may be whole; OSError and ValueError where it is not."""
+        """Return a file's bytes. Raises: CheckpointError if it may be whole; OSError, ValueError if it is not."""
         try:
             return read_file(inside(self.folder, name), most)
         except OSError as error:
@@ -224,11 +209,11 @@ class Checkpoints:
     def _not_now(self, reason: str) -> CheckpointError:
         return CheckpointError(
             f"the checkpoints in {self.folder} cannot be read now ({reason}), but may be whole; the same command tries "
-            f"again, resume=never keeps what is there and begins anew"
+            f"again, resume=never keeps this run and begins anew"
         )
 
     def _clean(self, generation: int, segments: set[str]) -> None:
-        """Remove generations but this one and the one before, and all segments but theirs."""
+        """Remove all generations but this one and the one before, and all segments but theirs."""
         for older in self._generations():
             if older < generation - 1:
                 shutil.rmtree(self.folder / _name(older), ignore_errors=True)
@@ -242,7 +227,7 @@ def _checksum(manifest: Mapping[str, Any]) -> str:
 
 
 def _segment(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """A segment as a manifest names it. Raises: KeyError, TypeError, ValueError."""
+    """Return a segment's entry in a manifest. Raises: KeyError, TypeError, ValueError."""
     since, next_id = int(entry["since"]), int(entry["next_id"])
     return {"name": str(entry["name"]), "since": since, "next_id": next_id, "sha256": dict(entry["sha256"])}
 
@@ -254,7 +239,7 @@ def _name(generation: int) -> str:
 def _disassemble(
     node: Any, path: str, tensors: dict[str, torch.Tensor], arrays: dict[str, np.ndarray[Any, Any]]
 ) -> Any:
-    """The tree with every tensor and array moved into its table, under the path it was found at."""
+    """Return the tree with each tensor and array moved into its table, under its path."""
     if isinstance(node, torch.Tensor):
         tensors[path] = node
         return {"$tensor": path}
@@ -273,6 +258,5 @@ def _assemble(node: Any, tensors: Mapping[str, torch.Tensor], arrays: Mapping[st
     if "$tensor" in node:
         return tensors[node["$tensor"]]
     if "$array" in node:
-        # ascontiguousarray has made vectors of scalars.
-        return arrays[node["$array"]].reshape(node["shape"])
+        return arrays[node["$array"]].reshape(node["shape"])  # ascontiguousarray made vectors of scalars
     return {key: _assemble(value, tensors, arrays) for key, value in node.items()}

@@ -40,12 +40,11 @@ class Episode:
 
     @property
     def steps(self) -> int:
-        """Decisions in the episode."""
         return len(self.actions)
 
     @property
     def values(self) -> npt.NDArray[np.float32] | None:
-        """What the network thought of each action before every step, (steps, actions); None if it was not asked."""
+        """The network's values before each step, (steps, actions); None for a player without a network."""
         return np.frombuffer(self.raw_values, np.float32).reshape(self.steps, -1) if self.raw_values else None
 
     @property
@@ -54,7 +53,7 @@ class Episode:
         return sum(self.random) / self.steps
 
     def action_counts(self, num_actions: int) -> npt.NDArray[np.int64]:
-        """How often each action was chosen, (actions, 2): by the network, by chance."""
+        """Count each action, (actions, 2): chosen by the network, by chance."""
         counts = np.zeros((num_actions, 2), np.int64)
         np.add.at(counts, (np.frombuffer(self.actions, np.uint8), np.frombuffer(self.random, np.uint8)), 1)
         return counts
@@ -70,7 +69,6 @@ class Evaluation:
 
     @cached_property
     def summary(self) -> Summary:
-        """The score distribution."""
         return summarize([episode.score for episode in self.episodes])
 
     @property
@@ -80,13 +78,13 @@ class Evaluation:
 
     @cached_property
     def action_counts(self) -> npt.NDArray[np.int64]:
-        """Those of all episodes together, (actions, 2): by the network, by chance."""
+        """Each action's decisions in all episodes, (actions, 2): by the network, by chance."""
         counts: npt.NDArray[np.int64] = self._action_counts.sum(axis=0)
         return counts
 
     @cached_property
     def _action_counts(self) -> npt.NDArray[np.int64]:
-        """Those of each episode, (episodes, actions, 2)."""
+        """The same in each episode, (episodes, actions, 2)."""
         return np.array([episode.action_counts(len(self.game.actions)) for episode in self.episodes])
 
     @property
@@ -96,7 +94,7 @@ class Evaluation:
 
     @property
     def chance_agreement(self) -> float | None:
-        """Share of the random decisions that equal the network's best action; None where that is not known."""
+        """Share of the random decisions that equal the network's best action; None if unknown."""
         agrees: list[bool] = []
         for episode in self.episodes:
             if (values := episode.values) is not None:
@@ -118,27 +116,18 @@ class Evaluation:
 
     @property
     def policy(self) -> str:
-        """In words, what the network does most."""
+        """The network's favourite action in words."""
         action, share = self.favourite
         if not share:
             return "chance alone"
         return f"{'collapsed: ' if self.collapsed else ''}{action} in {share:.1%} of the network's decisions"
 
     def metrics(self) -> dict[str, float]:
-        """Everything in one number each, under `evaluation/` and `actions/`."""
-        summary = self.summary
+        """Return the metrics under `evaluation/` and `actions/`."""
         shares = self.action_counts.sum(axis=1) / self.action_counts.sum()
         agreement = self.chance_agreement
         return {
-            "evaluation/mean": summary.mean,
-            "evaluation/median": summary.median,
-            "evaluation/high": summary.high,
-            "evaluation/low": summary.low,
-            "evaluation/lower_quartile": summary.lower_quartile,
-            "evaluation/upper_quartile": summary.upper_quartile,
-            "evaluation/interquartile_mean": summary.interquartile_mean,
-            "evaluation/standard_error": summary.standard_error,
-            "evaluation/episodes": summary.episodes,
+            **{f"evaluation/{name}": value for name, value in vars(self.summary).items()},
             "evaluation/epsilon": self.epsilon,
             "evaluation/steps_mean": float(np.mean([episode.steps for episode in self.episodes])),
             "evaluation/truncated_share": float(np.mean([episode.truncated for episode in self.episodes])),
@@ -157,23 +146,20 @@ class Evaluation:
         }
 
     def table(self) -> EpisodeTable:
-        """The episodes as they are kept."""
-        columns = ("seed", "score", "steps", "frames", "truncated")
-        values = {name: np.array([getattr(episode, name) for episode in self.episodes]) for name in columns}
+        """Return the table of the episodes."""
+        columns = ("score", "steps", "frames", "truncated", "points")
+        values = {name: np.array([getattr(episode, name) for episode in self.episodes], np.float64) for name in columns}
         return EpisodeTable(
             actions=self.game.actions,
             sources=self.game.sources,
-            seeds=values["seed"],
-            scores=values["score"].astype(np.float64),
-            steps=values["steps"].astype(np.float64),
-            frames=values["frames"].astype(np.float64),
-            truncated=values["truncated"].astype(np.float64),
+            seeds=np.array([episode.seed for episode in self.episodes]),
+            scores=values.pop("score"),
             counts=self._action_counts.astype(np.float64),
-            points=np.array([episode.points for episode in self.episodes], np.float64),
+            **values,
         )
 
     def report(self) -> str:
-        """The evaluation as the report prints it (figures 5.4, 5.5 and 5.9)."""
+        """Return the evaluation as the report prints it (figures 5.4, 5.5 and 5.9)."""
         summary, best = self.summary, self.best
         player = "player" if best.values is None else "neural net"
         return (
@@ -197,14 +183,14 @@ def evaluate(
     on_step: Callable[[Sequence[Episode]], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Evaluation:
-    """Play `episodes` episodes side by side; what each is like depends on `seed` and its own index alone.
+    """Play episodes side by side, each determined by `seed` and its index alone.
 
-    The environments are two halves: while one is emulated, the actor decides for the other. size in pixels and stack in
-    observations, as the actor's states want them. on_step is called with all episodes after
-    every step of a half.
+    The environments are two halves: while one is emulated, the actor decides for the other. States have `stack`
+    observations of `size` x `size` pixels. on_step is called with all episodes after every step of a half, `stop`
+    before it.
 
     Raises:
-        Stopped: when `stop`, which is asked before every step is received, says so.
+        Stopped: `stop` returned True.
     """
     game, emulators.stop = emulators.game, stop
     played = [
@@ -252,9 +238,7 @@ def evaluate(
             episode.rewards.append(reward)
             episode.score += reward
             if reward:
-                episode.points = [
-                    had + more for had, more in zip(episode.points, steps.points[row].tolist(), strict=True)
-                ]
+                episode.points = (steps.points[row] + episode.points).tolist()
             episode.frames += int(steps.frames[row])
             if steps.terminated[row] or steps.truncated[row]:
                 episode.over, episode.truncated = True, bool(steps.truncated[row])

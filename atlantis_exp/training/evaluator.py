@@ -1,4 +1,4 @@
-"""An evaluation protocol with all that it needs: emulators of its own, episodes, epsilon, film."""
+"""An evaluation protocol: emulators of its own, epsilon, seed, film."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class Evaluator:
     size: int  # pixels
     stack: int  # observations
     most_frames: int  # an episode
-    video: Part | None  # what is filmed of the best episode
+    video: Part | None  # the part of the best episode that is filmed
 
     def __call__(
         self,
@@ -34,13 +34,7 @@ class Evaluator:
         stop: Callable[[], bool] = lambda: False,
         emulators: Emulators | None = None,
     ) -> Evaluation:
-        """Play so many episodes.
-
-        emulators: those to play on; None: new ones.
-
-        Raises:
-            Stopped: when `stop` says so.
-        """
+        """Play so many episodes on `emulators`, by default new ones. Raises: Stopped when `stop` returns True."""
         with emulators or self.make_emulators(min(self.num_envs, episodes)) as emulators:
             return evaluate(
                 actor,
@@ -57,11 +51,7 @@ class Evaluator:
     def film(
         self, evaluation: Evaluation, progress: Progress, stop: Callable[[], bool] = lambda: False
     ) -> bytes | None:
-        """An mp4 of the best episode; None where there is to be none.
-
-        Raises:
-            Stopped: when `stop`, which is asked before every picture, says so.
-        """
+        """Return an mp4 of the best episode, None if none is wanted. Raises: Stopped; `stop` is asked every picture."""
         if self.video is None:
             return None
 

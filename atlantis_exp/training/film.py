@@ -1,4 +1,4 @@
-"""Film: an episode played again from its seed and actions, with who decided what next to the screen."""
+"""Film an episode by playing it again, with each decision next to the screen."""
 
 from collections.abc import Callable, Iterator
 from itertools import islice
@@ -17,18 +17,18 @@ FRAMES_A_MINUTE = 3_600  # of the game
 
 
 class Moment(NamedTuple):
-    """What was on screen before a step of an episode, and what was decided on it; at the end nothing was."""
+    """The screen before a step of an episode and the decision on it; None at the end."""
 
     screen: npt.NDArray[np.uint8]  # (210, 160, 3)
     score: float  # so far
     frame: int  # so far
     action: int | None
     random: bool
-    q_values: npt.NDArray[np.float32] | None  # (actions,), what the network thought of them even where chance chose
+    q_values: npt.NDArray[np.float32] | None  # (actions,), the network's, even if chance chose
 
 
 def moments(episode: Episode, emulator: Emulator, start: int = 0) -> Iterator[Moment]:
-    """Play an episode again from its seed and actions; moments begin before the step `start`."""
+    """Play an episode again from its seed and actions; yield its moments from the step `start` on."""
     emulator.reset(episode.seed)
     values = episode.values
     score, frame = 0.0, 0
@@ -43,7 +43,7 @@ def moments(episode: Episode, emulator: Emulator, start: int = 0) -> Iterator[Mo
 
 
 def span(episode: Episode, part: Part) -> tuple[int, int]:
-    """The first step of a part of an episode, and the step after its last; a minute is one of the game, on average."""
+    """Return the first step of a part of an episode and the step after its last; a minute is an average one."""
     minute = round(FRAMES_A_MINUTE * episode.steps / episode.frames)
     if part == "all" or minute >= episode.steps:
         return 0, episode.steps
@@ -57,9 +57,9 @@ def span(episode: Episode, part: Part) -> tuple[int, int]:
 def film_episode(
     episode: Episode, emulator: Emulator, part: Part, tell: Callable[[int, int], None] = lambda *_: None
 ) -> bytes:
-    """An mp4 of a part of an episode at the game's own speed of 60 frames a second, on average, with who decided what.
+    """Return an mp4 of a part of an episode at the game's speed: 60 frames a second, on average.
 
-    tell is called with how many of how many pictures are drawn.
+    tell is called with the numbers of pictures drawn and in all.
     """
     chooser = "player" if episode.values is None else "network"
     start, end = span(episode, part)
@@ -67,10 +67,8 @@ def film_episode(
     def pictures() -> Iterator[npt.NDArray[np.uint8]]:
         for index, moment in enumerate(islice(moments(episode, emulator, start), end - start + 1)):
             tell(index, end - start)
-            lines = (
-                f"step {start + index:,} of {episode.steps:,}",
-                f"score {moment.score:,.0f} of {episode.score:,.0f}",
-            )
+            step, score = f"step {start + index:,} of {episode.steps:,}", f"score {moment.score:,.0f}"
+            lines = step, f"{score} of {episode.score:,.0f}"
             source = "random" if moment.random else chooser
             yield scene(moment.screen, lines, source, emulator.game.actions, moment.action, moment.q_values)
 

@@ -1,4 +1,4 @@
-"""Fingerprints: what two trainings must have in common to be the same, a hash for each part."""
+"""Fingerprints: a hash for each part of a training, equal in two trainings that are the same."""
 
 import hashlib
 import json
@@ -17,10 +17,7 @@ WALL_CLOCK = ("throughput/steps_per_second", "throughput/hours")
 
 
 def fingerprint(state: Mapping[str, Any], memory: ReplayMemory, folder: Path) -> dict[str, str]:
-    """Hashes of a training's state, of its replay memory, and of the history that its run folder has committed.
-
-    Left out is what the time of day decides: seconds, timestamps, `WALL_CLOCK`, and the journal's length in bytes.
-    """
+    """Hash a training's state, its replay memory and its committed history, without anything that depends on time."""
     parts = {name: part for name, part in state.items() if name not in ("learner", "tracker")}
     parts["counters"] = {name: count for name, count in state["counters"].items() if name != "seconds"}
     learner = dict(state["learner"])
@@ -32,7 +29,7 @@ def fingerprint(state: Mapping[str, Any], memory: ReplayMemory, folder: Path) ->
 
 
 def history(folder: Path) -> list[dict[str, Any]]:
-    """The metrics, images and models that a run folder has committed, in their order, without the time of day."""
+    """Return the committed metrics, images and models, in order, without times."""
     events = []
     for _, record in read(folder):
         if isinstance(record, Metrics | Image | Model):

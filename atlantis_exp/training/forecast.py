@@ -1,4 +1,4 @@
-"""The budget planner: what a training will cost on this machine, from a few seconds of measurement on it."""
+"""Forecast the time, memory and disk of a training, from a few seconds of measurement on this machine."""
 
 import copy
 import math
@@ -7,7 +7,6 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import psutil
@@ -21,7 +20,7 @@ _WARM_MEMORY = 512 * 2**20  # bytes that torch and its thread buffers grow by on
 
 @dataclass(frozen=True)
 class Forecast:
-    """What to expect of a training, and what there is."""
+    """The costs of a training, and the memory and disk that are free."""
 
     steps_per_second: float
     steps: int
@@ -35,7 +34,7 @@ class Forecast:
 
     @property
     def hours(self) -> float:
-        """Of training, evaluations not counted."""
+        """Hours of training, without evaluations."""
         return self.steps / self.steps_per_second / 3600
 
     def __str__(self) -> str:
@@ -47,7 +46,7 @@ class Forecast:
 
     @property
     def shortage(self) -> str | None:
-        """What will not suffice and what to do about it, None where all does."""
+        """The resource that will not suffice and the remedy, None if all suffice."""
         if self.held <= self.learn_start:
             return (
                 f"nothing would be learned: replay.max_bytes holds some {self.held:,.0f} observations, and learning "
@@ -66,20 +65,11 @@ class Forecast:
         return None
 
 
-def forecast(
-    trainer: Trainer,
-    *,
-    capacity: int,
-    max_bytes: int,
-    size: int,
-    stack: int,
-    done: Counters,
-) -> Forecast:
-    """Time emulation, acting and learning with a trainer's parts, which are as before afterwards.
+def forecast(trainer: Trainer, *, capacity: int, max_bytes: int, size: int, stack: int, done: Counters) -> Forecast:
+    """Time emulation, acting and learning with a trainer's parts, and restore all but the emulators.
 
-    Its emulators have yet to begin, or to be brought back to, an episode. capacity in observations, max_bytes of the
-    replay memory, size in pixels; the memory that is measured is a throwaway one. What is left in episodes is taken to
-    be as long as those that are done, or as the game's usual ones.
+    Call it before their episodes begin or are loaded. capacity in observations, max_bytes of the replay memory, size in
+    pixels. Episodes left are taken to be as long as those done, or as the game's usual ones.
     """
     plan, learner, emulators = trainer.plan, trainer.learner, trainer.emulators
     num_envs = emulators.num_envs
@@ -96,7 +86,7 @@ def forecast(
             memory.add(env, int(actions[env]), float(steps.rewards[env]), steps.observations[env], False)
         ended = np.flatnonzero(steps.terminated | steps.truncated).tolist()
         for env, observation in zip(ended, emulators.reset(ended) if ended else (), strict=True):
-            memory.begin(env, observation)  # else a screen that stands still would be measured
+            memory.begin(env, observation)  # a game that is over would be measured otherwise
 
     def update() -> None:
         ids, weights = sampler.sample(memory, plan.batch_size, rng)
@@ -118,12 +108,13 @@ def forecast(
     steps = max(1, (length if trainer.max_steps is None else min(length, trainer.max_steps)) - done.steps)
     an_observation = memory.nbytes / (memory.next_id - memory.oldest_id)  # bytes
     replay_bytes = int(min(max_bytes, min(capacity, done.steps + steps) * an_observation))
-    there = trainer.memory.next_id - trainer.memory.oldest_id  # in a run that goes on, read already
-    more_bytes = max(0, replay_bytes - int(there * an_observation))
+    loaded = trainer.memory.next_id - trainer.memory.oldest_id  # observations, of a run that goes on
+    more_bytes = max(0, replay_bytes - int(loaded * an_observation))
     weights = sum(tensor.nbytes for tensor in learner.network.state_dict().values())
     cadence = trainer.recorder.cadence
     evaluations = 1 + steps / (cadence.evaluate_steps or math.inf)
     evaluations += steps / emulators.game.episode_steps / (cadence.evaluate_episodes or math.inf)
+    folder = next(path for path in (trainer.checkpoints.folder, *trainer.checkpoints.folder.parents) if path.exists())
     return Forecast(
         steps_per_second=1 / seconds_a_step,
         updates_per_second=1 / update_seconds,
@@ -132,7 +123,7 @@ def forecast(
         memory_available=psutil.virtual_memory().available,
         # Two generations of all networks and two moments; weights of each evaluation, in the folder and in MLflow.
         disk=int(more_bytes + (10 if learner.ema else 8) * weights + 2 * evaluations * weights),
-        disk_available=shutil.disk_usage(_existing(trainer.checkpoints.folder)).free,
+        disk_available=shutil.disk_usage(folder).free,
         held=max_bytes / an_observation,
         learn_start=plan.learn_start,
     )
@@ -148,16 +139,12 @@ def _median_seconds(call: Callable[[], object], at_least: int, seconds: float) -
     return statistics.median(taken)
 
 
-def _existing(path: Path) -> Path:
-    return next(folder for folder in (path, *path.parents) if folder.exists())
-
-
 def _size(count: float) -> str:
     return f"{count / 2**30:,.1f} GiB" if count >= 2**30 else f"{count / 2**20:,.0f} MiB"
 
 
 def duration(hours: float) -> str:
-    """Hours as a person reads them, in minutes where they are less than one, in seconds where those are."""
+    """Return a duration in words: hours, minutes or seconds."""
     if hours >= 1:
         return f"{hours:,.1f} hours"
     return f"{hours * 60:,.0f} minutes" if hours * 60 >= 2 else f"{hours * 3600:,.0f} seconds"

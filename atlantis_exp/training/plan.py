@@ -1,4 +1,4 @@
-"""What is trained when, and how often it is written down."""
+"""The plan of a training, and how often it is recorded."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -17,7 +17,7 @@ Count = Annotated[int, Field(ge=0, lt=2**53)]
 
 @dataclass
 class Counters:
-    """What was done so far, over all sessions."""
+    """The training so far, over all sessions."""
 
     steps: Count = 0
     frames: Count = 0
@@ -47,29 +47,29 @@ class Phase:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is trained when: phases one after the other, all measured in episodes or all in steps."""
+    """Phases one after the other, all measured in episodes or all in steps."""
 
     unit: Unit
     phases: Sequence[Phase]
     epsilon: Schedule
     learning_rate: Schedule  # share of the phase's
     returns: Returns
-    terminal_on_life_loss: bool  # for what is learned; the episode goes on
+    terminal_on_life_loss: bool  # for the learner; the episode goes on
     learn_every: int  # steps
     learn_start: int  # transitions in the memory
     batch_size: int  # transitions
 
     @property
     def length(self) -> int:
-        """Of all phases together, in the plan's unit."""
+        """The length of all phases, in the plan's unit."""
         return sum(phase.length for phase in self.phases)
 
     def done(self, counters: Counters) -> int:
-        """How much of `length` is done."""
+        """Return how much of `length` is done."""
         return counters.episodes if self.unit == "episodes" else counters.steps
 
     def phase_at(self, counters: Counters) -> Phase:
-        """The phase under way; the last one keeps what comes after it."""
+        """Return the phase under way; after the plan's end, the last one."""
         done = self.done(counters)
         for phase in self.phases:
             done -= phase.length
@@ -78,20 +78,20 @@ class Plan:
         return self.phases[-1]
 
     def learning_rate_at(self, counters: Counters) -> float:
-        """The step size of the next update."""
+        """Return the step size of the next update."""
         share = self.learning_rate(self.done(counters) / self.length, counters.steps)
         return self.phase_at(counters).learning_rate * share
 
     def epsilon_at(self, counters: Counters) -> float:
-        """The probability that chance takes the next decision."""
-        # The report counts the episode under way as one: its first has epsilon(1), not epsilon(0).
+        """Return the probability that chance takes the next decision."""
+        # The report counts the episode under way: its first has epsilon(1), not epsilon(0).
         running = 1 if self.unit == "episodes" else 0
         return self.epsilon((self.done(counters) + running) / self.length, counters.steps)
 
 
 @dataclass(frozen=True)
 class Cadence:
-    """How often things are written down, all of it without influence on what is learned."""
+    """How often a training is recorded, evaluated and committed, without influence on learning."""
 
     curve_steps: int  # steps between two points of a curve
     histogram_episodes: int  # episodes in a window's histogram
@@ -105,5 +105,5 @@ class Cadence:
 
 
 def passed(every: int | None, before: int, now: int) -> bool:
-    """Whether a multiple of `every` lies in (before, now]; never where there is none."""
+    """Tell whether a multiple of `every` lies in (before, now]; False for None."""
     return every is not None and now // every > before // every

@@ -1,4 +1,4 @@
-"""What a person sees of a training: a bar on a terminal, plain lines elsewhere."""
+"""Show a training to a person: a bar on a terminal, plain lines elsewhere."""
 
 import time
 from collections import deque
@@ -33,7 +33,7 @@ class Pace:
         self._latest = (0.0, 0)
 
     def tick(self, steps: int) -> None:
-        """To be called after every step, and once before the first."""
+        """Note the time of a step; call it after every step, and once before the first."""
         self._latest = now, _ = self._clock(), steps
         if not self._marks or now - self._marks[-1][0] >= _MARK_SECONDS:
             self._marks.append(self._latest)
@@ -42,7 +42,7 @@ class Pace:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Leave the time of the block out."""
+        """Do not count the time of the block."""
         start = self._clock()
         try:
             yield
@@ -91,11 +91,10 @@ class Progress:
         self._live: Live | None = None
 
     def say(self, text: str) -> None:
-        """A line of its own."""
         self.console.print(text)
 
     def is_due(self) -> bool:
-        """Whether it is time for `show`: a few times a second on a terminal, now and then elsewhere."""
+        """Tell whether it is time for `show`: a few times a second on a terminal, now and then elsewhere."""
         if self.console.is_terminal:
             return self._shown is None or time.monotonic() - self._shown >= _DRAW_SECONDS
         return self._is_time_for_a_line()
@@ -114,9 +113,9 @@ class Progress:
         self._live.update(table, refresh=True)
 
     def evaluating(self, episodes: Sequence["Episode"], most_frames: int) -> None:
-        """To be called after every step of an evaluation: writes a line now and then.
+        """Write a line now and then; call it after every step of an evaluation.
 
-        Good games last for minutes, and none for more than `most_frames`: so long it takes at most.
+        No episode has more than `most_frames`, which bounds the time left.
         """
         if self._evaluated is not episodes:
             self._evaluated, self._began = episodes, time.monotonic()
@@ -131,12 +130,12 @@ class Progress:
             )
 
     def filming(self, drawn: int, pictures: int) -> None:
-        """To be called with every picture of a film: writes a line now and then."""
+        """Write a line now and then; call it with every picture of a film."""
         if self._is_time_for_a_line():
             self._write(f"  film: {drawn:,} of {pictures:,} steps")
 
     def evaluated(self, step: int, frames: int, evaluation: "Evaluation") -> None:
-        """To be called after every evaluation of a training, with its step and the frames that were trained for."""
+        """Print a training's evaluation at a step, after so many frames of training."""
         summary, game = evaluation.summary, evaluation.game
         self.say(
             f"step {step:,}, {summary.episodes} episodes evaluated at epsilon {evaluation.epsilon}: "
@@ -176,14 +175,11 @@ def _line(snapshot: Snapshot) -> str:
             f"score {snapshot.scores[-1]:,.0f}  mean of 20 {np.mean(snapshot.scores):,.0f}  "
             f"duration {snapshot.lengths[-1]:,} (mean of 100 {np.mean(snapshot.lengths):,.0f})"
         )
+    left = "?"
+    if snapshot.steps_left is not None and snapshot.steps_per_second > 0 and snapshot.updates:
+        left = terminal.clock(snapshot.steps_left / snapshot.steps_per_second)  # steps are faster without updates
     return (
         f"episode {snapshot.episode:,}  {shown}  epsilon {snapshot.epsilon:.2f}  "
         f"step {snapshot.steps:,}  updates {snapshot.updates:,}  {snapshot.steps_per_second:,.0f} steps/s  "
-        f"phase {snapshot.phase}  {snapshot.share:.1%}  left {_time_left(snapshot)}"
+        f"phase {snapshot.phase}  {snapshot.share:.1%}  left {left}"
     )
-
-
-def _time_left(snapshot: Snapshot) -> str:
-    if snapshot.steps_left is None or snapshot.steps_per_second <= 0 or not snapshot.updates:
-        return "?"  # without updates steps go many times as fast
-    return terminal.clock(snapshot.steps_left / snapshot.steps_per_second)

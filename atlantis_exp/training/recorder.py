@@ -1,7 +1,6 @@
-"""What a training writes down: its episodes, curves, pictures, evaluations and description.
+"""Record a training: its episodes, curves, pictures, evaluations and description.
 
-Nothing of it is learned from. A metric of the training is added in `Recorder.curves`, one of an evaluation in
-`Evaluation.metrics`.
+To add a metric of the training see `Recorder.curves`, of an evaluation `Evaluation.metrics`.
 """
 
 import hashlib
@@ -25,14 +24,14 @@ from atlantis_exp.training.plan import Cadence, Counters, Plan
 from atlantis_exp.training.progress import Pace, Progress, Snapshot
 
 Stop = Callable[[], bool]
-Evaluate = Callable[[int, Progress, Stop], Evaluation]
+Play = Callable[[int, Progress, Stop], Evaluation]
 """Plays so many episodes. Raises: Stopped."""
 Film = Callable[[Evaluation, Progress, Stop], bytes | None]
-"""An mp4 of an evaluation's best episode, if there is to be one. Raises: Stopped."""
+"""Returns an mp4 of an evaluation's best episode, None if none is wanted. Raises: Stopped."""
 
 
 class Played(NamedTuple):
-    """An episode of the training, and how far the training was at its end."""
+    """An episode of the training, with the training's counters at its end."""
 
     episode: int  # counted from 1
     step: int
@@ -44,7 +43,7 @@ class Played(NamedTuple):
 
 @dataclass(frozen=True)
 class _Saved:
-    """The evaluations so far, as a recorder's state holds them."""
+    """The part of a recorder's state about evaluations, checked when it is loaded."""
 
     best_mean: float | None
     evaluations: Annotated[int, Field(ge=0, lt=2**53)]
@@ -52,38 +51,30 @@ class _Saved:
     owes_evaluation: bool
     best_step: Annotated[int, Field(ge=-1, lt=2**53)]
     last_report: str
-    last_metrics: dict[str, int | float]  # as they were, for resume is bit for bit
+    last_metrics: dict[str, int | float]  # ints stay ints: resume is bit for bit
     best_sha256: str = ""  # 0.1.0 has none
 
 
 class Diverged(Fault):
-    """The loss was no finite number; the last commit is from before."""
+    """The loss was not finite; the last commit is from before."""
 
 
+@dataclass(kw_only=True, eq=False)
 class Recorder:
-    """Tells a tracker and a person how a training goes; has a state of its own, and changes nobody else's.
+    """Tells a tracker and a person how a training goes, without influence on it."""
 
-    score_range: the axis of the pictures of scores.
-    about: markdown that ends the run's description: what it is and how to continue it.
-    """
+    plan: Plan
+    cadence: Cadence
+    learner: Learner
+    memory: ReplayMemory
+    tracker: Tracker
+    progress: Progress
+    play: Play
+    film: Film
+    score_range: tuple[float, float]  # the axis of the pictures of scores
+    about: str = ""  # markdown at the end of the run's description
 
-    def __init__(
-        self,
-        *,
-        plan: Plan,
-        cadence: Cadence,
-        learner: Learner,
-        memory: ReplayMemory,
-        tracker: Tracker,
-        progress: Progress,
-        evaluate: Evaluate,
-        film: Film,
-        score_range: tuple[float, float],
-        about: str = "",
-    ) -> None:
-        self.plan, self.cadence, self.learner, self.memory = plan, cadence, learner, memory
-        self.tracker, self.progress, self._evaluate, self._film = tracker, progress, evaluate, film
-        self.score_range, self.about = score_range, about
+    def __post_init__(self) -> None:
         self.episodes: list[Played] = []
         self.best_mean = -np.inf  # of all evaluations
         self.best_step = -1
@@ -97,25 +88,25 @@ class Recorder:
         self._max_steps: int | None = None
 
     def begin(self, counters: Counters, max_steps: int | None) -> None:
-        """To be called once a session, before its first step."""
+        """Begin a session, before its first step."""
         self._pace = Pace()
         self._pace.tick(counters.steps)
         self._max_steps = max_steps
         self._describe("running", counters)
 
     def end(self, counters: Counters, outcome: str) -> None:
-        """To be called once a session, before its last commit."""
+        """End a session, before its last commit."""
         self._write_episodes()
         self._describe(outcome, counters)
 
     def episode(self, played: Played) -> None:
-        """Write down an episode, and the pictures of those before it once their window is full."""
+        """Record an episode, and the pictures of its window once that is full."""
         self.episodes.append(played)
         self.tracker.metrics({"score/episode": played.score, "score/length": played.length}, played.step)
         if played.episode % self.cadence.histogram_episodes == 0:
             window = self.recent_scores(self.cadence.histogram_episodes)
             title = f"training, episodes {played.episode - len(window) + 1}-{played.episode}"
-            # A slider that counts windows, not steps: at each of its positions every run has a picture.
+            # The slider counts windows, not steps: at each position every run has a picture.
             number = played.episode // self.cadence.histogram_episodes - 1
             self.tracker.image("score/histogram", score_histogram(window, title, self.score_range), number)
             ends = [each.episode if self.plan.unit == "episodes" else each.step for each in self.episodes]
@@ -124,8 +115,8 @@ class Recorder:
             self.tracker.image("score/heatmap", picture, number)
 
     def curves(self, counters: Counters) -> None:
-        """Write down a point of every curve. Raises: Diverged."""
-        # The last multiple, not the step itself: curves of runs with different num_envs then share their grid.
+        """Record a point of every curve. Raises: Diverged."""
+        # At the last multiple: curves of runs with different num_envs then share their grid.
         step = counters.steps - counters.steps % self.cadence.curve_steps
         self._pace.tick(counters.steps)  # or the first step of a session would have none
         measures = {f"learning/{name}": value for name, value in self.learner.statistics().items()}
@@ -157,28 +148,25 @@ class Recorder:
         )
 
     def refuse_divergence(self) -> None:
-        """Raise Diverged if any loss so far was infinite or no number; waits for the device."""
+        """Raise Diverged if any loss so far was not finite; waits for the device."""
         if (update := self.learner.first_nonfinite_update()) is not None:
             raise Diverged(
-                f"the loss of update {update} is no finite number, and would be again; the run stays at its last "
-                "commit: lower optimizer.lr or set objective.reward_clip, which makes another run"
+                f"the loss of update {update} is not finite, and would be again; the run stays at its last commit: "
+                "lower optimizer.lr or set objective.reward_clip, which makes another run"
             )
 
     def show(self, counters: Counters) -> None:
-        """Let a person see how far it is; to be called after every step."""
+        """Show the progress if that is due; call it after every step."""
         self._pace.tick(counters.steps)
         if self.progress.is_due():
             self.progress.show(self._snapshot(counters))
 
     def evaluate(self, counters: Counters, num_envs: int, has_ended: bool, stop: Stop) -> None:
-        """Evaluate this step's network, unless that is done, and keep its weights; pending where it is stopped.
-
-        Raises: Diverged.
-        """
+        """Evaluate this step's network and keep its weights; pending if stopped. Raises: Diverged."""
         step = counters.steps
         if (every := self.cadence.evaluate_steps) and not has_ended:
-            # As with the curves: one that fell due on the way to this step belongs to where it fell due. The last one
-            # belongs to the run's last step, where a comparison looks for it.
+            # It belongs to the step at which it fell due, as with the curves; the last one to the run's last step,
+            # where a comparison looks for it.
             due = step - step % every
             step = due if step - due < num_envs else step
         episodes = self.cadence.final_episodes if has_ended else self.cadence.interim_episodes
@@ -189,9 +177,9 @@ class Recorder:
         self.evaluation_pending = True
         try:
             with self._pace.paused():
-                evaluation = self._evaluate(episodes, self.progress, stop)
+                evaluation = self.play(episodes, self.progress, stop)
                 is_best = evaluation.summary.mean > self.best_mean
-                video = self._film(evaluation, self.progress, stop) if is_best else None
+                video = self.film(evaluation, self.progress, stop) if is_best else None
         except Stopped:
             return
         self.evaluation_pending = False
@@ -221,7 +209,6 @@ class Recorder:
         self.progress.evaluated(step, counters.frames, evaluation)
 
     def recent_scores(self, count: int) -> list[float]:
-        """The scores of the last `count` episodes, the latest last."""
         return [played.score for played in self.episodes[-count:]]
 
     def state_dict(self) -> dict[str, Any]:
@@ -258,7 +245,7 @@ class Recorder:
         self.tracker.artifact(EPISODES, "\n".join([",".join(Played._fields), *lines, ""]).encode())
 
     def _describe(self, state: str, counters: Counters) -> None:
-        """Say in a few lines of markdown what the run is, how far it is and what it has reached."""
+        """Note in markdown the run's state, progress and result."""
         reached = self.last_metrics
         lines = [  # the result first: MLflow shows five lines and folds the rest
             f"**{state}** at step {counters.steps:,}: {counters.episodes:,} episodes, {counters.frames:,} frames, "

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -22,47 +22,40 @@ from atlantis_exp.training.recorder import Played, Recorder
 Outcome = Literal["finished", "budget", "interrupted"]
 
 
+@dataclass(kw_only=True, eq=False)
 class Trainer:
-    """One run: built parts in, `run` until the plan, the budget or a stop request ends it.
+    """Trains one run, made of built parts, until the plan, the budget or a stop request ends it.
 
-    With one environment the loop is the report's, one thing after the other. With several, the updates that are due
-    run while the emulators play; what is done, and in which order it takes effect, never depends on timing.
+    With one environment the loop is the report's. With several, due updates run while the emulators play; the result
+    never depends on timing.
     """
 
-    def __init__(
-        self,
-        *,
-        plan: Plan,
-        emulators: Emulators,
-        stack: FrameStack,
-        actor: Actor,
-        memory: ReplayMemory,
-        learner: Learner,
-        exploration: Sequence[np.random.Generator],
-        sampling: np.random.Generator,
-        seeds: Sequence[int],
-        recorder: Recorder,
-        checkpoints: Checkpoints,
-        max_steps: int | None,
-    ) -> None:
-        self.plan = plan
-        self.emulators, self.stack, self.actor = emulators, stack, actor
-        self.memory, self.learner = memory, learner
-        self.exploration, self.sampling, self.seeds = exploration, sampling, seeds
-        self.recorder, self.checkpoints = recorder, checkpoints
-        self.max_steps = max_steps
+    plan: Plan
+    emulators: Emulators
+    stack: FrameStack
+    actor: Actor
+    memory: ReplayMemory
+    learner: Learner
+    exploration: Sequence[np.random.Generator]  # one an environment
+    sampling: np.random.Generator
+    seeds: Sequence[int]  # of the first episodes
+    recorder: Recorder
+    checkpoints: Checkpoints
+    max_steps: int | None
+
+    def __post_init__(self) -> None:
         self.counters = Counters()
-        self.scores = np.zeros(emulators.num_envs)  # of the episodes under way
-        self.lengths = np.zeros(emulators.num_envs, np.int64)  # of the episodes under way, steps
+        self.scores = np.zeros(self.emulators.num_envs)  # of the episodes under way
+        self.lengths = np.zeros(self.emulators.num_envs, np.int64)  # of the episodes under way, steps
         self._errors: list[tuple[Sampler, npt.NDArray[np.int64], torch.Tensor]] = []  # of updates since the feedback
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
-        """Train from where the counters stand; commits before it returns.
+        """Train from where the counters stand, and commit. In case of an error the last commit stays.
 
         Raises:
-            Diverged: when the loss is no finite number; nothing is committed then.
-            WorkerDied: when an emulator's process has ended or hangs; the last commit stays.
-            OSError: when a commit cannot be written; the last one stays.
+            Diverged: the loss is not finite.
+            WorkerDied: an emulator's process has ended or hangs.
+            OSError: a commit cannot be written.
         """
         overlap = self.emulators.num_envs > 1  # learn while they play
         self.emulators.stop = stop
@@ -110,7 +103,7 @@ class Trainer:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.counters = Counters.of(state["counters"])
         due = self.counters.steps // self.plan.learn_every - self.counters.learn_ticks
-        if not 0 <= due <= self.emulators.num_envs:  # else the next step would make all these updates
+        if not 0 <= due <= self.emulators.num_envs:  # the next step would make all these updates
             raise ValueError(f"{due} updates are due")
         if self.memory.highest_action >= len(self.emulators.game.actions):
             raise ValueError(f"the replay memory holds action {self.memory.highest_action}, which the game lacks")
@@ -127,7 +120,7 @@ class Trainer:
             raise ValueError("the scores are not finite")
         self.recorder.load_state_dict(state)
         for env in range(self.emulators.num_envs):
-            if not self.memory.is_under_way(env):  # what came before in its episode was lost
+            if not self.memory.is_under_way(env):  # the episode's beginning was lost
                 self.memory.begin(env, self.stack.state[env, -1])
 
     @property
@@ -146,13 +139,13 @@ class Trainer:
             self._evaluate(stop)
 
     def _begin_episodes(self, envs: Sequence[int], seeds: Sequence[int] | None = None) -> None:
-        observations = self.emulators.reset(envs) if seeds is None else self.emulators.reset(envs, seeds)
+        observations = self.emulators.reset(envs, seeds)
         self.stack.reset(envs, observations)
         for row, env in enumerate(envs):
             self.memory.begin(env, observations[row])
 
     def _due_batches(self, sampler: Sampler) -> Iterator[Draw]:
-        """Draw a batch for each update that has fallen due."""
+        """Draw a batch for each update that is due."""
         due = self.counters.steps // self.plan.learn_every - self.counters.learn_ticks
         self.counters.learn_ticks += due
         if len(self.memory) <= self.plan.learn_start:
@@ -162,24 +155,19 @@ class Trainer:
             yield sampler.sample(self.memory, self.plan.batch_size, self.sampling)
 
     def _feed_back(self) -> None:
-        """Report earlier TD errors to their samplers; where chance took every decision, this waits for the device."""
+        """Report earlier TD errors to their samplers; may wait for the device."""
         for sampler, ids, errors in self._errors:
             sampler.feed_back(ids, errors.cpu().numpy())
         self._errors.clear()
 
     def _observe(self, decisions: Decisions) -> Steps:
-        """Wait for the emulators, and remember what they show."""
+        """Wait for the emulators, and store their step."""
         steps = self.emulators.receive()
         self.stack.push(steps.observations)
         terminal = steps.terminated | (steps.life_lost & self.plan.terminal_on_life_loss)
         for env in range(self.emulators.num_envs):
-            self.memory.add(
-                env,
-                int(decisions.actions[env]),
-                float(steps.rewards[env]),
-                steps.observations[env],
-                bool(terminal[env]),
-            )
+            action, reward = int(decisions.actions[env]), float(steps.rewards[env])
+            self.memory.add(env, action, reward, steps.observations[env], bool(terminal[env]))
         self.counters.steps += self.emulators.num_envs
         self.counters.frames += int(steps.frames.sum())
         self.counters.random += int(decisions.random.sum())
@@ -188,7 +176,7 @@ class Trainer:
         return steps
 
     def _record(self, steps: Steps, stop: Callable[[], bool]) -> None:
-        """Begin new episodes where some have ended, and write down, evaluate and commit what is due."""
+        """Begin new episodes where some have ended; record, evaluate and commit if due."""
         counters, cadence = self.counters, self.recorder.cadence
         steps_before, episodes_before = counters.steps - self.emulators.num_envs, counters.episodes
         for env in np.flatnonzero(steps.terminated | steps.truncated).tolist():
@@ -205,7 +193,7 @@ class Trainer:
             self._evaluate(stop)
         self._take_time()
         self.recorder.show(counters)
-        # Last: what else falls due at this step would be missing from a run that continues here.
+        # Last: a run that continues here would miss anything later in this step.
         overdue = time.monotonic() - self._last_commit >= cadence.commit_seconds
         if overdue or passed(cadence.commit_episodes, episodes_before, counters.episodes):
             self.commit()

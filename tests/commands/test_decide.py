@@ -55,7 +55,7 @@ Command = Callable[..., int]
         (("against=seed=3,model=cnn",), "seed: says how contenders are trained or measured, not what they are; one"),
         (("against=model=cnn",), "model=cnn: the same contender as the config without it"),
         (("against=model=rsenet",), "model=rsenet: no such option in conf/model; did you mean 'resnet'?"),
-        (("against=model",), "'model' is no override; write KEY=VALUE, as in model=resnet"),
+        (("against=model",), "'model' is not an override; write KEY=VALUE, as in model=resnet"),
         (("model=glob(*)",), "model=glob(*): not a list of values; write them out"),
     ],
 )

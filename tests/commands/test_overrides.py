@@ -245,21 +245,21 @@ def test_a_mistake_is_one_line_that_names_the_key_and_what_would_be_right(line: 
 
 
 def test_a_plugin_of_an_unknown_user_is_one_line_before_hydra_reads_it() -> None:
-    with pytest.raises(ConfigError, match=r"^plugins=~nobodyhere/mynet\.py: there is no such user"):
+    with pytest.raises(ConfigError, match=r"^plugins=~nobodyhere/mynet\.py: the user that ~ names does not exist"):
         located(["plugins=~nobodyhere/mynet.py"])
 
 
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        ("seed=range(0)", "seed=range(0): there is no value in it"),
-        ("optimizer.lr=interval(0,1)", "optimizer.lr=interval(0,1): no list of values; write them out"),
+        ("seed=range(0)", "seed=range(0): has no values"),
+        ("optimizer.lr=interval(0,1)", "optimizer.lr=interval(0,1): not a list of values; write them out"),
         (
             "model=glob(*)",
-            "model=glob(*): write the options out, as in model=cnn,cnn_small,resnet,resnet_fast",
+            "model=glob(*): list the options, as in model=cnn,cnn_small,resnet,resnet_fast",
         ),
-        ("model=glob(resnet*)", "model=glob(resnet*): write the options out, as in model=resnet,resnet_fast"),
-        ("seed=glob(*)", "seed=glob(*): no list of values; write them out"),
+        ("model=glob(resnet*)", "model=glob(resnet*): list the options, as in model=resnet,resnet_fast"),
+        ("seed=glob(*)", "seed=glob(*): not a list of values; write them out"),
         ("seed=1,range(0,3)", "seed=1,range(0,3): Unexpected type annotation"),
         ("seed=range(0,1,0)", "seed=range(0,1,0): range() arg 3 must not be zero"),
         ("seed=range(0,1000000000)", "seed=range(0,1000000000): more than 10,000 values"),
@@ -267,8 +267,11 @@ def test_a_plugin_of_an_unknown_user_is_one_line_before_hydra_reads_it() -> None
         ("optimizer.lr=range(0,1,1e-9)", "optimizer.lr=range(0,1,1e-9): more than 10,000 values"),
         ("seed=range(0,5000) model=cnn,resnet,resnet_fast", "these values make 15,000 jobs, more than 10,000: name"),
         (f"env.crop={'[' * 500}1{']' * 500}", f"env.crop={'[' * 51}...: lists within lists, too deep to be read"),
-        ("hydra/launcher=null", "hydra/launcher=null: of Hydra's own, hydra/launcher=NAME"),
-        ("hydra/launcher=joblib hydra.launcher.n_jobs=0", "hydra.launcher.n_jobs=0: should be how many jobs at a time"),
+        ("hydra/launcher=null", "hydra/launcher=null: use only hydra/launcher=NAME"),
+        (
+            "hydra/launcher=joblib hydra.launcher.n_jobs=0",
+            "hydra.launcher.n_jobs=0: write the number of jobs at a time",
+        ),
     ],
 )
 def test_a_sweep_that_cannot_be_is_one_line(line: str, reason: str) -> None:
@@ -322,7 +325,7 @@ def test_a_sweep_kept_in_a_file_is_the_one_typed_out(tmp_path: Path) -> None:
 def test_a_file_that_is_no_sweep_is_one_line(tmp_path: Path, text: str | None) -> None:
     if text is not None:
         (tmp_path / "mine.yaml").write_text(text)
-    with pytest.raises(ConfigError, match=r"^sweep=.*mine\.yaml: should be a file with KEY: VALUE .*$"):
+    with pytest.raises(ConfigError, match=r"^sweep=.*mine\.yaml: write KEY: VALUE .*$"):
         located([f"sweep={tmp_path / 'mine.yaml'}"])
 
 

@@ -16,6 +16,7 @@ from pydantic import TypeAdapter
 from atlantis_exp.comparison.decision import (
     Decision,
     Look,
+    Modes,
     Plan,
     condition,
     decide,
@@ -338,6 +339,8 @@ def test_seeds_that_are_all_equal_are_not_decided_but_within_any_delta() -> None
     rows = np.full((2, 10), 2_000.0)
     assert followed(rows).verdicts[0].said == "not decided"
     assert followed(rows, Plan(delta=1.0)).verdicts[0].said == "equivalent"
+    five_apart = rows + np.array([[0.0], [5.0]])
+    assert followed(five_apart, Plan(delta=5.0)).verdicts[0].said == "not decided"  # within is less than
 
 
 # What must hold for any scores.
@@ -554,6 +557,7 @@ def test_survivors_and_collapsed_are_two_modes() -> None:
     assert modes([480_000, 510_000, 505_000, 490_000, 520_000]) is None
     assert modes([2_000] * 5) is None
     assert modes([2_000, 500_000]) is None
+    assert modes([2_000, 500_000, 2_000]) == Modes(1 / 3, 500_000, 2_000)
 
 
 @few

@@ -170,6 +170,8 @@ def test_the_memory_is_the_newest_part_of_a_list_of_whole_transitions(
             assert_same_transitions(memory.gather(np.array(ids), returns), oracle.gather(ids, returns))
             np.testing.assert_array_equal(memory.rewards(np.array(ids)), oracle.gather(ids, ONE_STEP).r_t)
             assert set(memory.draw(50, np.random.default_rng(0)).tolist()) <= set(ids)
+            since = memory.next_id - 5
+            assert sorted(memory.completed(since)) == [k for k in ids if oracle.successors[k] >= since]
 
 
 @given(
@@ -332,7 +334,7 @@ def test_an_environment_idle_for_too_long_is_refused_before_its_distance_overflo
 
 
 def test_capacity_and_budget_too_small_for_a_transition_are_refused() -> None:
-    with pytest.raises(ValueError, match="does not fit a replay capacity of 4"):
+    with pytest.raises(ValueError, match="a transition of 5 observations does not fit a replay capacity of 4"):
         memory_of(4)
     with pytest.raises(ValueError, match="does not hold"):
         memory_of(10, noise_frames=8)
@@ -344,6 +346,29 @@ def test_a_segment_holds_what_is_stored_and_none_from_the_future() -> None:
     assert len(memory.segment(5)["lengths"]) == 20
     with pytest.raises(ValueError, match="none since 31"):
         memory.segment(31)
+
+
+def test_an_episode_s_first_observation_has_no_step() -> None:
+    memory = played(memory_of(40), 30)
+    memory.begin(0, np.zeros(SHAPE, np.uint8))
+    begun = {name: memory.state_dict()[name][-1].item() for name in ("back", "action", "reward", "terminal")}
+    assert begun == {"back": 0, "action": 0, "reward": 0.0, "terminal": False}
+
+
+def test_the_newest_segments_alone_are_the_memory_without_what_came_before() -> None:
+    memory = played(memory_of(100), 30)
+    written = memory.next_id
+    played(memory, 20)
+    rest = played(memory_of(100), 10)  # to be forgotten
+    rest.load_newest([memory.segment(written)], memory.next_id)
+    assert (rest.oldest_id, rest.next_id) == (written, memory.next_id)
+    assert [env for env in range(5) if rest.is_under_way(env)] == [0, 1, 2, 3]
+    ids = available_ids(rest)
+    assert_same_transitions(rest.gather(ids, ONE_STEP), memory.gather(ids, ONE_STEP))
+    rest.load_newest([], 77)
+    assert (len(rest), rest.oldest_id, rest.next_id, rest.is_under_way(0)) == (0, 77, 77, False)
+    rest.load_segments([])
+    assert (len(rest), rest.next_id) == (0, 0)
 
 
 def _set(name: str, index: int, value: object) -> Callable[[dict[str, Any]], None]:

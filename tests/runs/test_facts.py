@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from atlantis_exp.runs.facts import Facts, read_facts
+from atlantis_exp.runs.facts import JournalFacts, read_facts
 from atlantis_exp.runs.journal import Artifact, Journal, Tags, read
 
 
@@ -21,7 +21,7 @@ def test_each_tags_last_value_and_each_files_name_once_as_reading_every_line_fin
     for record in records:
         tags |= record.values if isinstance(record, Tags) else {}
     paths = dict.fromkeys(record.path for record in records if isinstance(record, Artifact))
-    assert facts == Facts(tags, tuple(paths))
+    assert facts == JournalFacts(tags, tuple(paths))
     assert facts.tags["policy"] == "at 49"
     assert "no" not in facts.tags
 
@@ -29,12 +29,12 @@ def test_each_tags_last_value_and_each_files_name_once_as_reading_every_line_fin
 def test_what_is_not_committed_does_not_count(tmp_path: Path) -> None:
     journal = Journal(tmp_path)
     journal.tags({"a": "1"})
-    assert read_facts(tmp_path) == Facts({}, ())
+    assert read_facts(tmp_path) == JournalFacts({}, ())
     journal.flush()
     journal.tags({"a": "2"})
     journal.artifact("file", b"")
     journal.state_dict()
-    assert read_facts(tmp_path) == Facts({"a": "1"}, ())
+    assert read_facts(tmp_path) == JournalFacts({"a": "1"}, ())
 
 
 def test_a_journal_that_was_cut_is_an_error(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import resource
 import shutil
 import time
@@ -19,6 +20,7 @@ from hypothesis import strategies as st
 from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import (
+    NOTE,
     Artifact,
     Image,
     Journal,
@@ -31,6 +33,7 @@ from atlantis_exp.runs.journal import (
     Tracker,
     adopt,
     curve,
+    has_lost_commit,
     read,
     read_commit,
 )
@@ -123,7 +126,8 @@ def test_a_writer_without_checkpoints_goes_on_behind_what_it_has_flushed(
     tmp_path: Path, clock: Callable[[int], None]
 ) -> None:
     first = Journal(tmp_path)
-    assert not first.resume()
+    assert first.resume() is False
+    first.note("what it is")
     first.metrics({"score": 1}, 1)
     first.flush()
     first.metrics({"score": 2}, 2)  # is lost
@@ -134,6 +138,7 @@ def test_a_writer_without_checkpoints_goes_on_behind_what_it_has_flushed(
     assert steps(tmp_path) == [1]
     second.finish()
     assert steps(tmp_path) == [1, 3]
+    assert records(tmp_path)[0] == Tags({NOTE: "what it is"})
     times = [record.time for record in records(tmp_path) if isinstance(record, Metrics)]
     assert times == sorted(times)
     before, after = read_commit(tmp_path), Journal(tmp_path)._commit
@@ -458,6 +463,32 @@ def test_a_model_has_a_plain_name(tmp_path: Path) -> None:
     for name in ("a/b", "a.b"):
         with pytest.raises(ValueError, match="neither"):
             Journal(tmp_path).model(name, b"", 0, {})
+
+
+def test_without_its_commit_a_journal_is_found_to_have_lost_it_and_its_whole_lines_count_again(tmp_path: Path) -> None:
+    Journal(tmp_path).status("RUNNING")
+    assert not has_lost_commit(tmp_path)
+    journaled(tmp_path, *range(3))
+    with open(tmp_path / "journal.jsonl", "ab") as file:
+        file.write(b'{"kind":"metrics","step":3,"ti')
+    assert not has_lost_commit(tmp_path)
+    (tmp_path / "commit.json").unlink()
+    assert has_lost_commit(tmp_path)
+    adopt(tmp_path, tmp_path.parent)  # as a sweep does with a run that has yet to begin
+    assert has_lost_commit(tmp_path)
+    assert records(tmp_path) == []
+    Journal(tmp_path).recover()
+    commit = read_commit(tmp_path)
+    assert commit is not None
+    assert (commit.status, steps(tmp_path), has_lost_commit(tmp_path)) == ("FINISHED", [0, 1, 2], False)
+
+
+def test_a_commit_with_a_number_in_quotes_is_damaged(tmp_path: Path) -> None:
+    journaled(tmp_path, 1)
+    path = tmp_path / "commit.json"
+    path.write_text(re.sub(r'"offset":(\d+)', r'"offset":"\1"', path.read_text()))
+    with pytest.raises(JournalError, match="is damaged"):
+        read_commit(tmp_path)
 
 
 def test_labels_and_errors_hold_from_the_first_moment_and_across_sessions(tmp_path: Path) -> None:

@@ -127,7 +127,7 @@ def test_a_pipe_in_a_card_s_place_is_one_line(
     (folder / "card.json").unlink()
     os.mkfifo(folder / "card.json")
     assert command("evaluate", f"weights={folder}", f"paths.outputs={folder.parent}/o") == 2
-    assert f"weights={folder}: card.json: {folder}/card.json is no regular file\n" in capsys.readouterr().err
+    assert f"weights={folder}: card.json: {folder}/card.json is not a regular file\n" in capsys.readouterr().err
 
 
 def test_weights_that_are_not_numbers_are_not_played(

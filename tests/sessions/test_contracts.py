@@ -15,7 +15,7 @@ from atlantis_exp.components import KINDS, admit
 from atlantis_exp.config import Config
 from atlantis_exp.faults import Fault
 from atlantis_exp.sessions.contracts import check as check_contracts
-from atlantis_exp.sessions.contracts import trials
+from atlantis_exp.sessions.contracts import contracts_of
 from atlantis_exp.sessions.job import Job, replaced
 
 Command = Callable[..., int]
@@ -118,7 +118,7 @@ def test_a_breach_is_named(
     (tmp_path / "mine.py").write_text(PARTS.replace(part, instead, 1))
     ((_, config),) = check("config", Config, [*tiny_overrides, f"plugins={tmp_path / 'mine.py'}", *CHOSEN]).items()
     broken = set()
-    for _, contract, trial in trials(config, Job(config), KINDS):
+    for _, contract, trial in contracts_of(config, Job(config), KINDS):
         if not contract.startswith("killed"):  # which takes processes
             try:
                 trial()
@@ -156,8 +156,8 @@ def test_components_that_are_named_are_tried_and_no_others(
     words = [text for text in tiny_overrides if text.partition("=")[0] not in KINDS]
     ((overrides, config),) = check("config", Config, [*words, f"plugins={tmp_path / 'mine.py'}", *chosen]).items()
     call: Any = _work(Asked(config, "check", overrides))
-    trials, jobs = call.args
-    assert {part for part, *_ in trials} == {*tried, "all"}
+    contracts, jobs = call.args
+    assert {part for part, *_ in contracts} == {*tried, "all"}
     assert [*jobs] == measured
 
 

@@ -66,7 +66,7 @@ def test_no_run_at_all_is_one_line_and_nothing_is_created(
     command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert command("evaluate", f"paths.outputs={tmp_path}/o") == 2
-    assert capsys.readouterr().err == f"atlantis_exp: run=latest: there is no training run under {tmp_path}/o/runs\n"
+    assert capsys.readouterr().err == f"atlantis_exp: run=latest: {tmp_path}/o/runs has no training runs\n"
     assert list(tmp_path.iterdir()) == []
 
 

@@ -108,7 +108,7 @@ def test_weights_that_no_training_can_begin_with_are_one_line_and_leave_nothing(
     capsys.readouterr()
     digest = read_card(exported)[0].sha256[:16]
     assert refused(f"training.weights={exported}x") == (
-        f"x: no folder of exported weights; did you mean '{exported}'? (valid: {exported})\n"
+        f"x: not a folder of exported weights; did you mean '{exported}'? (valid: {exported})\n"
     )
     assert refused(f"training.weights='{exported}@{16 * '0'}'") == f"@{16 * '0'}: the weights there are @{digest}\n"
     theirs = ": another network's (model=cnn, env.size=40, dqn)\n"

@@ -14,7 +14,7 @@ from atlantis_exp.commands import CHECKOUT, CONF
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.components import ENTRY_POINTS, KINDS, admit
 from atlantis_exp.config import Config
-from atlantis_exp.sessions.contracts import trials
+from atlantis_exp.sessions.contracts import contracts_of
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.new import EXAMPLES, begin
 
@@ -46,7 +46,7 @@ def test_what_is_written_keeps_every_contract(
     words = [*tiny_overrides, f"{kind}=my_own", f"plugins={source}"]
     ((_, config),) = check("config", Config, words).items()
     assert getattr(config, kind).component.load().__name__.startswith("MyOwn")
-    for _, contract, trial in trials(config, Job(config), [kind]):
+    for _, contract, trial in contracts_of(config, Job(config), [kind]):
         if not contract.startswith("killed"):
             trial()
 
@@ -61,7 +61,7 @@ def test_what_is_written_keeps_every_contract(
         (["to=x"], "new: name one component"),
         (["model=mynet", "sampler=mine", "to=x"], "new: name one component"),
         (["model=MyNet", "to=x"], "model=MyNet: a name has lowercase letters"),
-        (["model=class", "to=x"], "model=class: is a word of Python's own"),
+        (["model=class", "to=x"], "model=class: is a keyword of Python"),
         (["model=cnn", "to=x"], "model=cnn: is built in and is not replaced"),
     ],
 )

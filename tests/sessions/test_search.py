@@ -165,7 +165,7 @@ def test_a_record_of_the_trials_that_is_a_link_or_a_pipe_is_one_line(searching: 
             file.symlink_to(tmp_path / "mine")
         else:
             os.mkfifo(file)
-        with pytest.raises(Fault, match="is no regular file"):
+        with pytest.raises(Fault, match="is not a regular file"):
             Trials(trials.asked)
     assert (tmp_path / "mine").read_text() == "mine"
 
@@ -225,7 +225,7 @@ def test_the_best_is_called_lucky_and_tested_against_the_default_with_other_seed
     search(request, better_than_the_default)
     shown = capsys.readouterr().out
     assert "The best of 2 is partly luck: its own mean is optimistic.\n" in shown
-    assert "One training each: other seeds may rank the values differently" in shown
+    assert "One training each: other seeds may rank them differently" in shown
     values = [f"{key}={value}" for key, value in Trials(request).ranking[0][0].params.items()]
     (line,) = (line for line in shown.splitlines() if line.startswith("Better than the default? "))
     typed = shlex.split(line)[7:]

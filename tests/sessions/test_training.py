@@ -232,7 +232,7 @@ def test_a_damaged_file_of_a_run_is_one_clear_line_and_is_written_anew_once_it_i
     path = folder.path / name
     whole = json.loads(path.read_bytes())
     path.write_text(damaged)
-    with pytest.raises(Fault, match=f"{path} is damaged: remove it and issue the run's command again"):
+    with pytest.raises(Fault, match=f"{path} is damaged: remove it and repeat the run's command"):
         train(Job(tiny(*SHORT)))
     path.unlink()
     train(Job(tiny(*SHORT)))
@@ -443,7 +443,7 @@ def test_counters_that_no_training_comes_to_are_one_line(
     """Before anything is expected of them."""
     saved = {**dataclasses.asdict(Counters(steps=80, episodes=2)), **forged}
     monkeypatch.setattr(Checkpoints, "load", lambda *_: {"counters": saved})
-    with pytest.raises(CheckpointError, match=r"is none of this training \((ValueError|TypeError): "):
+    with pytest.raises(CheckpointError, match=r"is not of this training \((ValueError|TypeError): "):
         train(Job(tiny(*SHORT, "budget.forecast=warn")))
 
 

@@ -90,7 +90,7 @@ def test_slurm_where_there_is_none_and_wrong_settings_are_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert refusal() == "hydra/launcher=slurm: there is no srun here; submit from a machine of the cluster"
+    assert refusal() == "hydra/launcher=slurm: srun is missing here; submit from a machine of the cluster"
     (tmp_path / "srun").write_text("#!/bin/sh")
     (tmp_path / "srun").chmod(0o755)
     assert refusal("hydra.launcher.partion=x").startswith(

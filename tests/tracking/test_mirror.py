@@ -340,10 +340,10 @@ def test_images_are_named_and_sized_as_mlflow_itself_does(tmp_path: Path, store:
 @pytest.mark.parametrize(
     ("kind", "width", "end", "fault"),
     [
-        ("EPS", 8, None, "is no PNG of a run: not a PNG file"),  # PIL would have Ghostscript draw it
+        ("EPS", 8, None, "is not a PNG of a run: not a PNG file"),  # PIL would have Ghostscript draw it
         ("PNG", 4_097, None, "4,097 x 4 pixels"),
-        ("PNG", 8, 45, "is no PNG"),
-        ("PNG", 8, 0, "is no PNG"),
+        ("PNG", 8, 45, "is not a PNG"),
+        ("PNG", 8, 0, "is not a PNG"),
     ],
 )
 def test_an_image_that_is_no_picture_of_ours_is_a_damaged_folders(

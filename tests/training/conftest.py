@@ -173,7 +173,7 @@ def small() -> Callable[..., Trainer]:
                 memory=memory,
                 tracker=Journal(folder),
                 progress=Progress(console or Console(quiet=True)),
-                evaluate=partial(evaluator, EpsilonGreedy(learner.evaluated_q_values, NUM_ACTIONS, watches=True)),
+                play=partial(evaluator, EpsilonGreedy(learner.evaluated_q_values, NUM_ACTIONS, watches=True)),
                 film=evaluator.film,
                 score_range=ATLANTIS.score_range,
             ),

@@ -17,7 +17,7 @@ from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.runs.files import read_file
 from atlantis_exp.runs.journal import read_commit
 from atlantis_exp.training import checkpoint
-from atlantis_exp.training.checkpoint import FORMAT, CheckpointError, Checkpoints, _checksum
+from atlantis_exp.training.checkpoint import FORMAT, CheckpointError, Checkpoints, _checksum, unforged
 from atlantis_exp.training.fingerprint import fingerprint
 from atlantis_exp.training.trainer import Trainer
 
@@ -191,9 +191,9 @@ def test_a_checkpoint_of_another_experiment_or_a_newer_format_is_refused(two_gen
     path = two_generations / "00000002/manifest.json"
     manifest = json.loads(path.read_bytes())
     del manifest["sha256"]
-    manifest["format"] = FORMAT + 1
+    manifest["format"] = 2
     path.write_text(json.dumps({**manifest, "sha256": _checksum(manifest)}))
-    with pytest.raises(CheckpointError, match=f"format {FORMAT + 1}, this version reads up to {FORMAT}"):
+    with pytest.raises(CheckpointError, match="format 2, this version reads up to 1"):
         restored(two_generations)
 
 
@@ -225,6 +225,10 @@ def test_frequent_saves_leave_no_crumbs(tmp_path: Path) -> None:
         checkpoints.save({}, memory_of(observations, of=memory))
     assert len(list(tmp_path.glob("segments/*"))) <= 64 + 3
     assert len(list(tmp_path.glob("0*"))) == 2
+    (tmp_path / "00000200").mkdir()
+    (tmp_path / "00000200/tensors.safetensors").touch()  # of a save that a crash ended
+    checkpoints.save({}, memory)
+    assert files_of(tmp_path / "00000200") == ["manifest.json", "state.json"]
     assert same(restored(tmp_path)[1], memory)
 
 
@@ -345,16 +349,24 @@ def test_a_death_at_any_file_operation_of_a_commit_leaves_the_commit_before_or_t
     assert len(steps) > 20
 
 
-@pytest.mark.parametrize(("damaged", "oldest", "lost"), [("000000000000", 100, 100), ("000000000100", 150, 150)])
+def test_a_state_that_is_none_of_this_training_is_one_line_with_the_reason(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"\(KeyError: 'weights'\)"), unforged(tmp_path):
+        dict[str, int]()["weights"]
+
+
+@pytest.mark.parametrize(
+    ("capacity", "damaged", "oldest", "lost"),
+    [(640, "000000000000", 100, 100), (640, "000000000100", 150, 150), (180, "000000000000", 100, 80)],
+)
 def test_where_a_segment_that_generations_share_is_damaged_the_observations_behind_it_go_on(
-    tmp_path: Path, damaged: str, oldest: int, lost: int
+    tmp_path: Path, capacity: int, damaged: str, oldest: int, lost: int
 ) -> None:
-    checkpoints, memory = Checkpoints(tmp_path, "abc"), memory_of(100)
+    checkpoints, memory = Checkpoints(tmp_path, "abc"), memory_of(100, capacity)
     for step, end in enumerate((100, 150, 200), start=1):
         checkpoints.save({"step": step}, memory_of(end, of=memory))
     [path] = tmp_path.glob(f"segments/{damaged}*/arrays.safetensors")
     path.write_bytes(b"")
-    state, loaded, said = restored(tmp_path)
+    state, loaded, said = restored(tmp_path, capacity)
     assert state == {"step": 3}
     assert (loaded.oldest_id, loaded.next_id) == (oldest, 200)
     ids = np.flatnonzero(loaded.available(np.arange(200)))
@@ -362,3 +374,8 @@ def test_where_a_segment_that_generations_share_is_damaged_the_observations_behi
     ours, theirs = (each.gather(ids, Returns(0.9)) for each in (loaded, memory))
     assert all(np.array_equal(getattr(ours, name), getattr(theirs, name)) for name in ours._fields)
     assert said[-1] == f"no checkpoint has its whole replay memory: {lost} observations are lost, the run goes on"
+    goes_on, last = Checkpoints(tmp_path, "abc"), ReplayMemory(capacity, (8, 8), budget_bytes=2**20)
+    goes_on.load(last)
+    goes_on.save({"step": 4}, memory_of(250, of=last))
+    state, again, said = restored(tmp_path, capacity)
+    assert (state, said, same(again, last)) == ({"step": 4}, [], True)

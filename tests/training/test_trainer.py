@@ -4,6 +4,7 @@ import shutil
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,16 +13,16 @@ import torch
 
 from atlantis_exp.build import make_emulator
 from atlantis_exp.config import Config
-from atlantis_exp.game.vector import WorkerDied
+from atlantis_exp.game.vector import Steps, WorkerDied
 from atlantis_exp.learning.schedules import Linear
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.replay.samplers import Draw, PrioritizedSampler, Sampler, TopHalfSampler, UniformSampler
 from atlantis_exp.runs.journal import NOTE, Metrics, Tags, read
-from atlantis_exp.training.actor import ConstantActor
+from atlantis_exp.training.actor import ConstantActor, Decisions
 from atlantis_exp.training.evaluation import Evaluation
 from atlantis_exp.training.fingerprint import fingerprint
 from atlantis_exp.training.plan import Phase
-from atlantis_exp.training.recorder import Diverged
+from atlantis_exp.training.recorder import Diverged, Played
 from atlantis_exp.training.trainer import Trainer
 
 Compose = Callable[..., Config]
@@ -230,7 +231,7 @@ def test_learning_rate_and_sampler_change_with_the_phase_and_nothing_else_does(s
     assert trainer.learner.updates == len(tape) == 30
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize("num_envs", [1, 2])
 @pytest.mark.parametrize(
     ("learn_every", "learn_start"),
     [(7, 33), (1, 0), (4, 20), (50, 49)],
@@ -267,20 +268,20 @@ def test_updates_are_those_that_a_naive_loop_counts(
     assert tape == naive
 
 
-@pytest.mark.parametrize("num_envs", [1, 8])
+@pytest.mark.parametrize(("num_envs", "few"), [(1, 37), (8, 7)])
 def test_a_prioritized_training_continued_every_few_steps_is_the_unbroken_one(
-    small: Small, tmp_path: Path, num_envs: int
+    small: Small, tmp_path: Path, num_envs: int, few: int
 ) -> None:
     """With eight environments several updates fall due at once, and the memory forgets what awaits its error."""
     prints = []
-    for name, few in (("unbroken", 1_000), ("broken", 7)):
+    for name, steps in (("unbroken", 1_000), ("broken", few)):
         outcome = ""
         while outcome != "finished":
             prioritized = phases(160, PrioritizedSampler(0.5, 0.5))
             trainer = small(
                 *(tmp_path / name,), num_envs=num_envs, phases=prioritized, capacity=70, learn_every=2, **NEVER
             )
-            outcome = trainer.run(after(few))
+            outcome = trainer.run(after(steps))
         prints.append(print_of(trainer, tmp_path / name))
     assert prints[0] == prints[1]
 
@@ -350,7 +351,7 @@ def test_a_loss_that_is_no_number_stops_the_run_at_its_last_good_commit(small: S
     trainer.run(after(100))
     good = print_of(trainer, tmp_path)
     next(trainer.learner.network.parameters()).data[:] = np.nan
-    with pytest.raises(Diverged, match=f"update {trainer.learner.updates} is no finite number"):
+    with pytest.raises(Diverged, match=f"update {trainer.learner.updates} is not finite"):
         trainer.run()
     assert print_of(small(tmp_path, **quiet), tmp_path) == good
 
@@ -403,11 +404,92 @@ def test_a_run_goes_on_after_its_worker_was_killed(tiny: Compose, started: Start
     assert print_of(continued, tmp_path / "broken") == print_of(unbroken, tmp_path / "unbroken")
 
 
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_what_is_counted_is_what_a_naive_loop_counts(small: Small, tmp_path: Path, num_envs: int) -> None:
+    trainer = small(tmp_path, num_envs=num_envs, **NEVER)
+    receive, act, decided, shown = trainer.emulators.receive, trainer.actor.act, list[Decisions](), list[Steps]()
+
+    def acted(*asked: Any) -> Decisions:
+        decided.append(act(*asked))
+        return decided[-1]
+
+    def received(*asked: Any) -> Steps:
+        shown.append(receive(*asked))
+        return shown[-1]
+
+    trainer.actor = SimpleNamespace(act=acted)
+    trainer.emulators.receive = received  # type: ignore[method-assign]
+    assert trainer.run() == "finished"
+    steps = frames = 0
+    scores, lengths = [0.0] * num_envs, [0] * num_envs
+    episodes: list[Played] = []
+    for each in shown:
+        steps, frames = steps + num_envs, frames + sum(each.frames.tolist())
+        for env in range(num_envs):
+            scores[env], lengths[env] = scores[env] + each.rewards[env], lengths[env] + 1
+            if each.terminated[env] or each.truncated[env]:
+                episodes.append(Played(len(episodes) + 1, steps, frames, scores[env], lengths[env], env))
+                scores[env], lengths[env] = 0.0, 0
+    assert trainer.recorder.episodes == episodes != []
+    counted = trainer.counters
+    assert (counted.steps, counted.frames, counted.episodes) == (steps, frames, len(episodes))
+    assert counted.random == sum(each.random.sum() for each in decided)
+    assert 0 < counted.random < steps
+
+
+def test_a_commit_is_due_after_its_seconds_and_a_training_has_the_seconds_of_all_its_sessions(
+    small: Small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, commits = 1_000.0, []
+    monkeypatch.setattr("time.monotonic", lambda: now)
+
+    def session(last: int) -> None:
+        trainer = small(tmp_path, commit_seconds=10.0, **NEVER)
+        save = trainer.checkpoints.save
+
+        def saved(state: dict[str, Any], memory: ReplayMemory) -> None:
+            commits.append((state["counters"]["steps"], state["counters"]["seconds"]))
+            save(state, memory)
+
+        def a_second_later() -> bool:
+            nonlocal now
+            now += 1
+            return trainer.counters.steps == last
+
+        trainer.checkpoints.save = saved  # type: ignore[method-assign, assignment]
+        trainer.run(a_second_later)
+
+    session(25)
+    now += 1_000_000
+    session(48)
+    assert commits == [(10, 10), (20, 20), (25, 26), (35, 36), (45, 46), (48, 50)]
+    notes = [record.values[NOTE] for _, record in read(tmp_path) if isinstance(record, Tags) and NOTE in record.values]
+    assert [note.partition(":")[0] for note in notes] == [
+        *("**running** at step 0", "**interrupted** at step 25", "**running** at step 25", "**interrupted** at step 48")
+    ]
+
+
+def test_a_training_whose_replay_memory_is_lost_goes_on_from_what_is_on_the_screen(
+    small: Small, tmp_path: Path
+) -> None:
+    begun = small(tmp_path, num_envs=2, **NEVER)
+    begun.run(after(30))
+    for path in tmp_path.glob("checkpoints/segments/*/*"):
+        path.write_bytes(b"")
+    goes_on = small(tmp_path, num_envs=2, **NEVER)
+    assert (goes_on.memory.oldest_id, goes_on.memory.next_id) == (62, 64)
+    shown = goes_on.stack.state[:, -1].copy()
+    goes_on.run(after(1))
+    first = goes_on.memory.gather(np.array([62, 63]), goes_on.plan.returns).s_t
+    assert np.array_equal(first, np.repeat(shown[:, None], 4, axis=1))
+    assert goes_on.run() == "finished"
+
+
 def test_the_description_counts_the_hours_of_the_last_evaluation_too(
     small: Small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trainer = small(tmp_path, evaluate_steps=None, evaluate_episodes=None, evaluate_at_end=True, max_steps=80)
-    played, late, clock = trainer.recorder._evaluate, 0.0, time.monotonic
+    played, late, clock = trainer.recorder.play, 0.0, time.monotonic
 
     def an_hour(*asked: Any) -> Evaluation:
         nonlocal late
@@ -415,7 +497,7 @@ def test_the_description_counts_the_hours_of_the_last_evaluation_too(
         return played(*asked)
 
     monkeypatch.setattr("time.monotonic", lambda: clock() + late)
-    monkeypatch.setattr(trainer.recorder, "_evaluate", an_hour)
+    trainer.recorder.play = an_hour
     assert trainer.run() == "budget"
     tags = [record.values for _, record in read(tmp_path) if isinstance(record, Tags)]
     assert " 1.00 hours" in [values[NOTE] for values in tags if NOTE in values][-1]
