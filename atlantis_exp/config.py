@@ -384,6 +384,7 @@ class BudgetConfig:
     """Limits of this command that are no part of the experiment."""
 
     steps: Count | None
+    flops: Annotated[float, Field(gt=0)] | None = None  # of updates; no key of older runs and cards
     wall_clock: str | Count | None  # a number alone is in seconds
     forecast: Literal["refuse", "warn", "off"]
 

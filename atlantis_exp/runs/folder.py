@@ -1,6 +1,7 @@
 """Run folders: where a run lives, what its files are called, who holds it, and how it ended."""
 
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, Self, TypeVar
 
 from atlantis_exp.checking import nearest, parse
-from atlantis_exp.config import Config
+from atlantis_exp.config import BudgetConfig, Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs import lock
 from atlantis_exp.runs.files import SMALL, Natural, inside, read_file, schema_of, write_file
@@ -49,7 +50,7 @@ class Result:
 
     outcome: str
     steps: Natural
-    counts: dict[str, float]  # episodes, frames, updates and hours of a training
+    counts: dict[str, float]  # episodes, frames, updates, FLOPs of updates and hours of a training
     evaluation: dict[str, float]  # empty where there was none
     report: str
     evaluated_at: Natural | None = None  # step of the last evaluation, if that was before the last one
@@ -57,6 +58,12 @@ class Result:
     def __post_init__(self) -> None:
         if self.evaluation and (missing := EVALUATED - self.evaluation.keys()):
             raise ValueError(f"its evaluation lacks {min(missing)}")
+
+    def spent(self, budget: BudgetConfig) -> dict[str, float]:
+        """Return those limits of a budget that a training has reached, by their keys."""
+        done = {"budget.steps": self.steps, "budget.flops": self.counts.get("flops", 0)}
+        most = {"budget.steps": budget.steps, "budget.flops": budget.flops}
+        return {key: limit for key, limit in most.items() if limit is not None and done[key] >= limit}
 
 
 @dataclass(frozen=True)
@@ -115,11 +122,25 @@ class RunFolder:
         """How the run ended; None also while it is being made longer, when `result` is of its end before."""
         return self.result if self.state == "done" else None
 
-    def ended(self, budget: int | None) -> Result | None:
-        """How the run has ended, None if it goes on: it has not, or did by its budget of steps and has now a larger."""
+    def ended(self, budget: BudgetConfig) -> Result | None:
+        """How the run has ended, None if it goes on: it has not, or its budget ended it and is now larger."""
         if not self.has_started or (result := self.result) is None:
             return None
-        return None if result.outcome == "budget" and (budget is None or budget > result.steps) else result
+        return None if result.outcome == "budget" and not result.spent(budget) else result
+
+    def beyond(self, budget: BudgetConfig) -> tuple[str, str] | None:
+        """Return the limit that the run was trained beyond and what it was trained for; None where it was not."""
+        if (result := self.result) is None:
+            return None
+        config = self.trained_config
+        # All environments step at once, and the updates that fall due with their steps are made at once.
+        updates = math.ceil(config.env.num_envs / config.training.learn_every)
+        if budget.steps is not None and result.steps - config.env.num_envs >= budget.steps:
+            return f"budget.steps={budget.steps}", f"{result.steps:,} steps"
+        flops, done = result.counts.get("flops", 0), result.counts.get("updates", 0)
+        if budget.flops is not None and flops and flops * (1 - updates / done) >= budget.flops:
+            return f"budget.flops={budget.flops:g}", f"{flops:.4g} FLOPs"
+        return None
 
     def put_aside(self) -> Path:
         """Renames the folder, for a new run to have its place; returns where it is now. Raises: Fault while held."""

@@ -111,6 +111,8 @@ class Contest:
             "budget.steps": self.config.budget.steps,
             "evaluation.epsilon": self.config.evaluation.epsilon,
         }
+        if self.config.budget.flops is not None:  # an older decision names none
+            identity["budget.flops"] = self.config.budget.flops
         return RunFolder(self.outputs / "decisions" / f"decide-{digest(identity)}")
 
     @property
@@ -152,17 +154,13 @@ class Contest:
         return RunFolder.of(self.job(label, seed).config)
 
     def _has_ended(self, folder: RunFolder) -> bool:
-        return folder.ended(self.config.budget.steps) is not None
+        return folder.ended(self.config.budget) is not None
 
     def _refuse_longer_runs(self) -> None:
-        if (steps := self.config.budget.steps) is None:
-            return
         for folder in self.runs:
-            # All environments step at once, so that the last of these steps may end beyond the budget.
-            result = folder.result
-            if result is not None and result.steps - folder.trained_config.env.num_envs >= steps:
+            if (longer := folder.beyond(self.config.budget)) is not None:
                 raise ConfigError(
-                    f"budget.steps={steps}: run {folder.name} was trained for {result.steps:,} steps; ask for as many, "
+                    f"{longer[0]}: run {folder.name} was trained for {longer[1]}; ask for as many, "
                     "or for other paths.outputs"
                 )
 

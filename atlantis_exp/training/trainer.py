@@ -16,7 +16,7 @@ from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.replay.samplers import Draw, Sampler
 from atlantis_exp.training.actor import Actor, Decisions
 from atlantis_exp.training.checkpoint import Checkpoints
-from atlantis_exp.training.plan import Counters, Plan, passed
+from atlantis_exp.training.plan import Counters, Plan, passed, step_of
 from atlantis_exp.training.recorder import Played, Recorder
 
 Outcome = Literal["finished", "budget", "interrupted"]
@@ -44,13 +44,14 @@ class Trainer:
         recorder: Recorder,
         checkpoints: Checkpoints,
         max_steps: int | None,
+        max_updates: int | None = None,
     ) -> None:
         self.plan = plan
         self.emulators, self.stack, self.actor = emulators, stack, actor
         self.memory, self.learner = memory, learner
         self.exploration, self.sampling, self.seeds = exploration, sampling, seeds
         self.recorder, self.checkpoints = recorder, checkpoints
-        self.max_steps = max_steps
+        self.max_steps, self.max_updates = max_steps, max_updates
         self.counters = Counters()
         self.scores = np.zeros(emulators.num_envs)  # of the episodes under way
         self.lengths = np.zeros(emulators.num_envs, np.int64)  # of the episodes under way, steps
@@ -133,15 +134,26 @@ class Trainer:
     @property
     def has_ended(self) -> bool:
         """Whether the plan or the budget is used up."""
-        budget_spent = self.max_steps is not None and self.counters.steps >= self.max_steps
-        return budget_spent or self.plan.done(self.counters) >= self.plan.length
+        return (
+            (self.max_steps is not None and self.counters.steps >= self.max_steps)
+            or (self.max_updates is not None and self.learner.updates >= self.max_updates)
+            or self.plan.done(self.counters) >= self.plan.length
+        )
+
+    @property
+    def last_step(self) -> int | None:
+        """The step at which the budget will end the training, about; None without a budget."""
+        plan, steps = self.plan, [] if self.max_steps is None else [self.max_steps]
+        if self.max_updates is not None:
+            steps.append(step_of(self.max_updates, plan.learn_start, plan.learn_every))
+        return min(steps, default=None)
 
     def _begin(self, stop: Callable[[], bool]) -> None:
         if self.memory.next_id == 0:
             self._begin_episodes(range(self.emulators.num_envs), self.seeds)
         self._session_start = time.monotonic() - self.counters.seconds
         self._last_commit = time.monotonic()
-        self.recorder.begin(self.counters, self.max_steps)
+        self.recorder.begin(self.counters, self.last_step)
         if self.recorder.evaluation_pending:
             self._evaluate(stop)
 

@@ -246,6 +246,19 @@ def test_a_run_that_was_trained_longer_than_is_asked_is_no_seed_of_the_question(
         asking("model=cnn,resnet", "budget.steps=160")
 
 
+def test_contenders_are_asked_about_at_equal_arithmetic(asking: Asking, recorded: Recorded) -> None:
+    contest = asking("model=cnn,resnet", "budget.flops=3e3")
+    assert contest.folder != asking("model=cnn,resnet").folder
+    assert contest.folder == asking("model=cnn,resnet", "budget.flops=3000").folder
+    recorded("model=cnn", "seed=0", "budget.flops=3e3", outcome="budget", updates=30)  # of 100 FLOPs each
+    recorded("model=resnet", "seed=0", "budget.flops=2e3", outcome="budget", updates=20)
+    assert contest.needed(None)["cnn"] == [1, 2, 3, 4]
+    assert contest.needed(None)["resnet"] == [0, 1, 2, 3, 4]
+    longer = recorded("model=resnet", "seed=3", outcome="finished", updates=31)
+    with pytest.raises(ConfigError, match=f"^budget.flops=3000: run {longer.name} was trained for 3100 FLOPs; ask"):
+        asking("model=cnn,resnet", "budget.flops=3e3")
+
+
 @pytest.mark.slow
 def test_a_training_that_fails_ends_the_decision_in_one_line_that_says_how_it_goes_on(
     asking: Asking, recorded: Recorded
