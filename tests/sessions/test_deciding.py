@@ -24,6 +24,7 @@ from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import NOTE, Tags, read_commit
 from atlantis_exp.sessions.deciding import Contest, decide, say_what_it_takes
 from atlantis_exp.sessions.job import Job, replaced
+from atlantis_exp.sessions.launchers import BASIC, Launcher
 
 REPOSITORY = Path(__file__).parents[2]
 # Networks so young hold one action: seeds differ since each plays other games, with half of the decisions random.
@@ -304,8 +305,10 @@ def test_before_it_starts_it_says_how_many_runs_there_may_be_and_what_they_can_f
     asking: Asking, recorded: Recorded, capsys: pytest.CaptureFixture[str]
 ) -> None:
     contest = asking("model=cnn,resnet_fast", "delta=5%")
+    contest.here = Launcher("joblib", {"n_jobs": 4, "cores": 2})
     assert said(contest, capsys).splitlines() == [
         "cnn, resnet_fast: 10 to 20 runs, looks at 5 and 10 seeds each; 0 are there.",
+        "4 trainings at a time, 2 cores each",
         "a difference of 12 % of the score is found, and no difference where delta is 14 % or more, with 80 % at 10 "
         "seeds",
         "(if a contender's seeds differ as published ones do (Dopamine's agents, five seeds): 9 % of their mean, "
@@ -317,13 +320,14 @@ def test_before_it_starts_it_says_how_many_runs_there_may_be_and_what_they_can_f
         recorded("model=cnn", f"seed={seed}", scores=(score, score, score, score))
     assert said(contest, capsys).splitlines() == [
         "cnn, resnet_fast: 10 to 20 runs, looks at 5 and 10 seeds each; 4 are there.",
+        "4 trainings at a time, 2 cores each",
         "a difference of 11 % of the score is found, and no difference where delta is 13 % or more, with 80 % at 10 "
         "seeds",
         "(if a contender's seeds differ as those that are there do: 8 % of their mean, standard deviation)",
     ]
     shown = said(asking("model=cnn,resnet_fast", "sampler=uniform,top_half", "seeds=5"), capsys).splitlines()
     assert shown[0].endswith("20 runs, looks at 5 seeds each; 4 are there.")
-    assert [line.partition(" is found")[0] for line in shown[1:-1]] == [
+    assert [line.partition(" is found")[0] for line in shown[2:-1]] == [
         "by model, a difference of 14 % of the score",
         "by sampler, a difference of 14 % of the score",
         "by model,sampler, a difference of 27 % of the score",
@@ -332,10 +336,17 @@ def test_before_it_starts_it_says_how_many_runs_there_may_be_and_what_they_can_f
 
 @pytest.mark.slow
 def test_before_it_starts_it_says_what_hours_the_runs_take(asking: Asking, capsys: pytest.CaptureFixture[str]) -> None:
-    shown = said(asking("model=cnn,resnet_fast", "budget.forecast=warn"), capsys)
+    contest = asking("model=cnn,resnet_fast", "budget.forecast=warn")
+    contest.here = BASIC
+    shown = said(contest, capsys)
+    assert "one training after the other" in shown
     assert re.search(r"^ *cnn: [\d,]+ (seconds|minutes) a run, alone on this machine", shown, re.MULTILINE)
     assert re.search(r"resnet_fast: [\d,]+ (seconds|minutes) a run, alone on this machine", shown)
     assert re.search(r"at most [\d,]+ (seconds|minutes) where they run one after the other", shown)
+    contest.here = Launcher("joblib", {"n_jobs": 4, "cores": 1})
+    shown = said(contest, capsys)
+    assert re.search(r"^ *cnn: [\d,]+ (seconds|minutes) a run, on its share", shown, re.MULTILINE)
+    assert re.search(r"at most [\d,]+ (seconds|minutes) so many at a time, evaluations not counted", shown)
 
 
 @pytest.mark.slow
