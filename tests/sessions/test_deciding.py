@@ -20,6 +20,7 @@ from atlantis_exp.commands.decide import DecideConfig, contest_of
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.machine import all_cores
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import NOTE, Tags, read_commit
 from atlantis_exp.sessions.deciding import Contest, decide, say_what_it_takes
@@ -364,6 +365,8 @@ def test_a_decision_that_was_killed_goes_on_and_ends_as_the_unbroken_one(
             assert process.poll() is None
             assert time.monotonic() < patience
             time.sleep(0.05)
+        if all_cores() > 1:
+            assert len([*runs.glob("*/output.txt")]) > 1  # of trainings side by side
         process.send_signal(sent)
         out, error = process.communicate()
         assert process.returncode == ended, out + error
@@ -399,13 +402,11 @@ def test_a_launcher_trains_what_the_decision_needs_with_a_sampler_from_a_file(
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)  # seconds
-def test_the_end_of_a_decision_has_its_launchers_jobs_commit(
-    deciding: Callable[..., subprocess.Popen[str]], tmp_path: Path
+@pytest.mark.parametrize("launcher", [(), ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")])
+def test_the_end_of_a_decision_has_its_jobs_commit(
+    deciding: Callable[..., subprocess.Popen[str]], tmp_path: Path, launcher: tuple[str, ...]
 ) -> None:
-    process = deciding(
-        *(CAPS, "phase.quick.steps=100_000", "tracking.commit_seconds=0.5"),
-        *("hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),
-    )
+    process = deciding(CAPS, "phase.quick.steps=100_000", "tracking.commit_seconds=0.5", *launcher)
     folder = tmp_path / "o" / "runs"
     patience = time.monotonic() + 200
     while not any(

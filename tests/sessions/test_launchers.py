@@ -31,6 +31,8 @@ REPOSITORY = Path(__file__).parents[2]
 FREQUENT = ("tracking=mlflow", "tracking.commit_seconds=0.5", "evaluation.every_steps=null")
 LONG = (*FREQUENT, "phase.quick.steps=100_000")
 
+ROOMY = ("replay.capacity=900_000", "phase.quick.steps=900_000", "env.size=210")
+
 Compose = Callable[..., Config]
 Sweep = Callable[..., subprocess.Popen[bytes]]
 
@@ -134,13 +136,9 @@ def test_jobs_that_are_left_share_the_cores_of_the_machine(
         (("threads=4",), (10, 16, 16, 64, False), 4, 4),
         (("env.workers=8",), (10, 16, 16, 64, False), 2, 8),
         (("threads=32",), (10, 16, 16, 64, False), 1, 16),
-        (
-            ("replay.max_bytes=2_147_483_648", "replay.capacity=900_000", "phase.quick.steps=900_000", "env.size=210"),
-            (10, 16, 16, 16, False),
-            5,
-            3,
-        ),
-        (("replay.capacity=900_000", "phase.quick.steps=900_000", "env.size=210"), (10, 16, 16, 16, False), 10, 1),
+        ((*ROOMY, "replay.max_bytes=2_147_483_648"), (10, 16, 16, 16, False), 5, 3),
+        ((*ROOMY, "replay.max_bytes=268_435_456"), (10, 16, 16, 16, False), 10, 1),
+        ((*ROOMY, "replay.max_bytes=2_147_483_648", "budget.steps=999"), (10, 16, 16, 16, False), 10, 1),
     ],
 )
 def test_as_many_trainings_go_on_at_a_time_as_the_machine_runs_well(
