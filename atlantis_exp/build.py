@@ -1,7 +1,6 @@
 """The composition root: a checked config enters, a trainer or an evaluation made of built parts leaves."""
 
 import dataclasses
-import math
 import zlib
 from collections.abc import Callable
 from functools import partial
@@ -353,22 +352,6 @@ def build_cadence(evaluation: cfg.EvaluationConfig, tracking: cfg.TrackingConfig
     )
 
 
-def _most_updates(config: cfg.Config, learner: Learner) -> int | None:
-    """Return the updates after which budget.flops is spent. Raises: ConfigError where an update has no FLOPs."""
-    if (flops := config.budget.flops) is None:
-        return None
-    if not (each := flops_per_update(config, learner)):
-        raise ConfigError(
-            f"budget.flops={flops:g}: no FLOPs are counted of model={config.model.name}; use budget.steps"
-        )
-    return -(-math.ceil(flops) // each)
-
-
-def flops_per_update(config: cfg.Config, learner: Learner) -> int:
-    """Return the floating-point operations of one of a training's updates."""
-    return learner.update_flops((config.env.stack, config.env.size, config.env.size), config.training.batch_size)
-
-
 def build_trainer(
     config: cfg.Config, cores: int, folder: Path, tracker: Tracker, progress: Progress, about: str = ""
 ) -> Trainer:
@@ -381,7 +364,7 @@ def build_trainer(
     )
     game = facts_of(config.game)
     watched = EpsilonGreedy(learner.evaluated_q_values, len(game.actions), watches=True)
-    return Trainer(
+    trainer = Trainer(
         plan=plan,
         emulators=make_emulators(evaluator.make_emulator, env.num_envs, env.workers or cores),
         stack=FrameStack(env.num_envs, env.size, env.stack),
@@ -405,5 +388,8 @@ def build_trainer(
         ),
         checkpoints=Checkpoints(folder / CHECKPOINTS, config.identity()),
         max_steps=config.budget.steps,
-        max_updates=_most_updates(config, learner),
+        max_flops=config.budget.flops,
     )
+    if config.budget.flops is not None and not trainer.flops_per_update:
+        raise ConfigError(f"budget.flops: no FLOPs are counted of model={config.model.name}; use budget.steps")
+    return trainer

@@ -392,6 +392,12 @@ class BudgetConfig:
         check_time("budget.wall_clock", self.wall_clock, "90s, 10min or 3h")
 
     @property
+    def limits(self) -> dict[str, float]:
+        """What ends a training, by key."""
+        limits = {"budget.steps": self.steps, "budget.flops": self.flops}
+        return {key: limit for key, limit in limits.items() if limit is not None}
+
+    @property
     def seconds(self) -> int | None:
         """`wall_clock` in seconds."""
         return None if self.wall_clock is None else seconds(self.wall_clock)

@@ -254,7 +254,7 @@ def _training(run: StoredRun, config: Config, epsilon: float | None) -> Training
     if folder.result is None:
         state = f"failed: {folder.error}" if folder.state == "failed" else "unfinished"
         raise _Unusable(f"{state}: the command that started it continues it")
-    if (result := folder.ended(config.budget)) is None:
+    if (result := folder.ended(config.budget.limits)) is None:
         raise _Unusable("unfinished: it was made longer; the command that did so continues it")
     at_end = [each for each in run.evaluations if each.step == result.steps and each.path.exists()]
     if not (taken := [each for each in at_end if epsilon in (None, each.epsilon)]):
@@ -265,7 +265,7 @@ def _training(run: StoredRun, config: Config, epsilon: float | None) -> Training
     is_filmed = not is_own or run.tags.get("best_evaluation", "").endswith(f" at step {result.steps}")
     science = config.science()
     science["phase"] = {str(index): phase for index, phase in enumerate(science["phase"])}
-    spent = result.spent(config.budget) if result.outcome == "budget" else {}
+    spent = result.spent(config.budget.limits) if result.outcome == "budget" else {}
     return Training(
         folder.name,
         run.config | {"evaluation.epsilon": latest.epsilon, "budget.steps": None, "budget.flops": None} | spent,

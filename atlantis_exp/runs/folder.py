@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, Self, TypeVar
 
 from atlantis_exp.checking import nearest, parse
-from atlantis_exp.config import BudgetConfig, Config
+from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs import lock
 from atlantis_exp.runs.files import SMALL, Natural, inside, read_file, schema_of, write_file
@@ -59,11 +59,10 @@ class Result:
         if self.evaluation and (missing := EVALUATED - self.evaluation.keys()):
             raise ValueError(f"its evaluation lacks {min(missing)}")
 
-    def spent(self, budget: BudgetConfig) -> dict[str, float]:
-        """Return those limits of a budget that a training has reached, by their keys."""
+    def spent(self, limits: Mapping[str, float]) -> dict[str, float]:
+        """Return those of a budget's limits that the training has reached."""
         done = {"budget.steps": self.steps, "budget.flops": self.counts.get("flops", 0)}
-        most = {"budget.steps": budget.steps, "budget.flops": budget.flops}
-        return {key: limit for key, limit in most.items() if limit is not None and done[key] >= limit}
+        return {key: limit for key, limit in limits.items() if done[key] >= limit}
 
 
 @dataclass(frozen=True)
@@ -122,24 +121,25 @@ class RunFolder:
         """How the run ended; None also while it is being made longer, when `result` is of its end before."""
         return self.result if self.state == "done" else None
 
-    def ended(self, budget: BudgetConfig) -> Result | None:
+    def ended(self, limits: Mapping[str, float]) -> Result | None:
         """How the run has ended, None if it goes on: it has not, or its budget ended it and is now larger."""
         if not self.has_started or (result := self.result) is None:
             return None
-        return None if result.outcome == "budget" and not result.spent(budget) else result
+        return None if result.outcome == "budget" and not result.spent(limits) else result
 
-    def beyond(self, budget: BudgetConfig) -> tuple[str, str] | None:
+    def beyond(self, limits: Mapping[str, float]) -> tuple[str, str] | None:
         """Return the limit that the run was trained beyond and what it was trained for; None where it was not."""
         if (result := self.result) is None:
             return None
         config = self.trained_config
         # All environments step at once, and the updates that fall due with their steps are made at once.
         updates = math.ceil(config.env.num_envs / config.training.learn_every)
-        if budget.steps is not None and result.steps - config.env.num_envs >= budget.steps:
-            return f"budget.steps={budget.steps}", f"{result.steps:,} steps"
+        steps, most = limits.get("budget.steps"), limits.get("budget.flops")
+        if steps is not None and result.steps - config.env.num_envs >= steps:
+            return f"budget.steps={steps}", f"{result.steps:,} steps"
         flops, done = result.counts.get("flops", 0), result.counts.get("updates", 0)
-        if budget.flops is not None and flops and flops * (1 - updates / done) >= budget.flops:
-            return f"budget.flops={budget.flops:g}", f"{flops:.4g} FLOPs"
+        if most is not None and flops and flops * (1 - updates / done) >= most:
+            return f"budget.flops={most:g}", f"{flops:.4g} FLOPs"
         return None
 
     def put_aside(self) -> Path:

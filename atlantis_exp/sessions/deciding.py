@@ -155,11 +155,11 @@ class Contest:
         return RunFolder.of(self.job(label, seed).config)
 
     def _has_ended(self, folder: RunFolder) -> bool:
-        return folder.ended(self.config.budget) is not None
+        return folder.ended(self.config.budget.limits) is not None
 
     def _refuse_longer_runs(self) -> None:
         for folder in self.runs:
-            if (longer := folder.beyond(self.config.budget)) is not None:
+            if (longer := folder.beyond(self.config.budget.limits)) is not None:
                 raise ConfigError(
                     f"{longer[0]}: run {folder.name} was trained for {longer[1]}; ask for as many, "
                     "or for other paths.outputs"

@@ -245,7 +245,7 @@ class Trials:
             return None
         result = run.result
         assert result is not None
-        if (longer := run.beyond(config.budget)) is not None:
+        if (longer := run.beyond(config.budget.limits)) is not None:
             raise Fault(f"run {run.name} was trained for {longer[1]} already, more than {longer[0]}")
         return result.evaluation["evaluation/mean"]
 

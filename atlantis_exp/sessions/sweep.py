@@ -68,7 +68,7 @@ def ledger(
 
 def say_hours(jobs: Sequence[Job], launcher: Launcher) -> None:
     """Print how many of a sweep's jobs are trained at a time, and the hours that all take if they are as the first."""
-    left = [job for job in jobs if RunFolder.of(job.config).ended(job.config.budget) is None]
+    left = [job for job in jobs if RunFolder.of(job.config).ended(job.config.budget.limits) is None]
     if not left:
         return
     at_once = min(launcher.settings.get("n_jobs", 1), len(left))

@@ -12,14 +12,7 @@ from typing import Any
 import torch
 
 from atlantis_exp import terminal
-from atlantis_exp.build import (
-    build_trained_network,
-    build_trainer,
-    choose_device,
-    described,
-    flops_per_update,
-    import_components,
-)
+from atlantis_exp.build import build_trained_network, build_trainer, choose_device, described, import_components
 from atlantis_exp.checking import flatten, to_dict
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault, RunFault, in_words
@@ -77,7 +70,7 @@ def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int |
                     at = f"{trainer.counters.steps:,}"
                     progress.say(f"SIGTERM: committed at step {at}, going on until Slurm ends it")
                     outcome = trainer.run(lambda: stop() or watched())
-        result = _close(trainer, config, folder, journal, outcome)
+        result = _close(trainer, folder, journal, outcome)
     steps = f"{trainer.counters.steps:,}"
     if outcome != "interrupted":
         print(f"\n{result.report}\n\nrun {folder.name}: {steps} steps, {trainer.counters.seconds:,.0f} s")
@@ -109,7 +102,7 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
         print(f"the run that was here is kept as {folder.put_aside()}")
         if parent is not None:
             adopt(folder.path, parent)
-    if (result := folder.ended(config.budget)) is None:
+    if (result := folder.ended(config.budget.limits)) is None:
         if folder.has_lost_checkpoints:
             raise Fault(
                 f"run {folder.name}: its checkpoints are gone from {folder.checkpoints}: put them back, or begin anew "
@@ -118,8 +111,8 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
         return False
     how = f"{result.outcome} after {result.steps:,} steps"
     print(f"run {folder.name} has ended ({how}):\n\n{result.report}")
-    limits = {"budget.steps": config.budget.steps, "budget.flops": config.budget.flops}
-    unspent = [f"{key}={limit}" for key, limit in limits.items() if limit and key not in result.spent(config.budget)]
+    limits = config.budget.limits
+    unspent = [f"{key}={limit}" for key, limit in limits.items() if key not in result.spent(limits)]
     if result.outcome == "finished" and unspent:
         print(f"\n{' '.join(unspent)} adds nothing to a plan that is over. {_begin_with(job, folder)}")
     return True
@@ -167,7 +160,7 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
     if state is None:
         journal.params({key: str(value) for key, value in flatten(to_dict(config)).items()})
         journal.artifact(CONFIG, (folder.path / CONFIG).read_bytes())
-        journal.tags({"flops_per_update": str(flops_per_update(config, trainer.learner))})
+        journal.tags({"flops_per_update": str(trainer.flops_per_update)})
     else:
         with unforged(folder.checkpoints), terminal.working("playing the games up to where they were"):
             trainer.load_state_dict(state)
@@ -256,14 +249,14 @@ def _faults_recorded(job: Job, folder: RunFolder, journal: Journal) -> Iterator[
         raise
 
 
-def _close(trainer: Trainer, config: Config, folder: RunFolder, journal: Journal, outcome: Outcome) -> Result:
+def _close(trainer: Trainer, folder: RunFolder, journal: Journal, outcome: Outcome) -> Result:
     """Say how the session has ended and, where the run has, keep its result."""
     counters, recorder = trainer.counters, trainer.recorder
     counts = {
         "episodes": counters.episodes,
         "frames": counters.frames,
         "updates": trainer.learner.updates,
-        "flops": trainer.learner.updates * flops_per_update(config, trainer.learner),
+        "flops": trainer.learner.updates * trainer.flops_per_update,
         "hours": counters.seconds / 3600,
     }
     report = recorder.last_report or "no evaluation (evaluation.at_end=false)"

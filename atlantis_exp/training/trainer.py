@@ -1,8 +1,10 @@
 """The training loop (report figure 3.1), as a page that reads like it."""
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -44,14 +46,14 @@ class Trainer:
         recorder: Recorder,
         checkpoints: Checkpoints,
         max_steps: int | None,
-        max_updates: int | None = None,
+        max_flops: float | None = None,
     ) -> None:
         self.plan = plan
         self.emulators, self.stack, self.actor = emulators, stack, actor
         self.memory, self.learner = memory, learner
         self.exploration, self.sampling, self.seeds = exploration, sampling, seeds
         self.recorder, self.checkpoints = recorder, checkpoints
-        self.max_steps, self.max_updates = max_steps, max_updates
+        self.max_steps, self.max_flops = max_steps, max_flops
         self.counters = Counters()
         self.scores = np.zeros(emulators.num_envs)  # of the episodes under way
         self.lengths = np.zeros(emulators.num_envs, np.int64)  # of the episodes under way, steps
@@ -130,6 +132,17 @@ class Trainer:
         for env in range(self.emulators.num_envs):
             if not self.memory.is_under_way(env):  # what came before in its episode was lost
                 self.memory.begin(env, self.stack.state[env, -1])
+
+    @cached_property
+    def flops_per_update(self) -> int:
+        """The floating-point operations of one update."""
+        _, stack, height, width = self.stack.state.shape
+        return self.learner.update_flops((stack, height, width), self.plan.batch_size)
+
+    @cached_property
+    def max_updates(self) -> int | None:
+        """The fewest updates that cost `max_flops`."""
+        return None if self.max_flops is None else -(-math.ceil(self.max_flops) // self.flops_per_update)
 
     @property
     def has_ended(self) -> bool:

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import torch
 
-from atlantis_exp.build import build_learner, flops_per_update
+from atlantis_exp.build import build_learner
 from atlantis_exp.checking import parse, to_dict
 from atlantis_exp.commands.overrides import read_override
 from atlantis_exp.commands.train import VERB
@@ -207,13 +207,13 @@ def test_a_budget_of_arithmetic_ends_a_run_at_the_step_that_spends_it_and_a_larg
     tiny: Compose, more: str
 ) -> None:
     quiet = ("evaluation.at_end=false", "evaluation.every_steps=null")
-    each = flops_per_update(config := tiny(*quiet), build_learner(config))
+    each = build_learner(tiny(*quiet)).update_flops((4, 40, 40), 4)
     for flops in (5 * each, 5 * each + 1):  # ends at five updates, then at six
         train(Job(config := tiny(*quiet, f"budget.flops={flops}")))
         result = RunFolder.of(config).result
         assert result is not None
         assert (result.outcome, result.counts["flops"]) == ("budget", each * -(-flops // each))
-        assert RunFolder.of(config).ended(config.budget) == result
+        assert RunFolder.of(config).ended(config.budget.limits) == result
     train(Job(config := tiny(*quiet, more)))
     result = RunFolder.of(config).result
     assert result is not None

@@ -180,7 +180,7 @@ def small() -> Callable[..., Trainer]:
             ),
             checkpoints=Checkpoints(folder / "checkpoints", "small"),
             max_steps=max_steps,
-            max_updates=max_updates,
+            max_flops=None if max_updates is None else max_updates * learner.update_flops((STACK, SIZE, SIZE), 4),
         )
         if (state := trainer.checkpoints.load(trainer.memory)) is not None:
             trainer.load_state_dict(state)
