@@ -350,7 +350,7 @@ def build_trainer(
     evaluator = build_evaluator(env, config.evaluation, cores)
     cadence, game = build_cadence(config.evaluation, config.tracking), facts_of(config.game)
     watched = EpsilonGreedy(learner.evaluated_q_values, len(game.actions), watches=True)
-    return Trainer(
+    trainer = Trainer(
         plan=plan,
         emulators=make_emulators(evaluator.make_emulator, env.num_envs, env.workers or cores),
         stack=FrameStack(env.num_envs, env.size, env.stack),
@@ -374,4 +374,8 @@ def build_trainer(
         ),
         checkpoints=Checkpoints(folder / CHECKPOINTS, config.identity()),
         max_steps=config.budget.steps,
+        max_flops=config.budget.flops,
     )
+    if config.budget.flops is not None and not trainer.flops_per_update:
+        raise ConfigError(f"budget.flops: no FLOPs are counted of model={config.model.name}; use budget.steps")
+    return trainer

@@ -356,11 +356,18 @@ class BudgetConfig:
     """Limits of this command, which do not change the experiment."""
 
     steps: Count | None
+    flops: Annotated[float, Field(gt=0)] | None = None  # of updates; no key of older runs and cards
     wall_clock: str | Count | None  # a number alone is in seconds
     forecast: Literal["refuse", "warn", "off"]
 
     def __post_init__(self) -> None:
         check_time("budget.wall_clock", self.wall_clock, "90s, 10min or 3h")
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """What ends a training, by key."""
+        limits = {"budget.steps": self.steps, "budget.flops": self.flops}
+        return {key: limit for key, limit in limits.items() if limit is not None}
 
     @property
     def seconds(self) -> int | None:

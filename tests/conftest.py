@@ -256,16 +256,18 @@ def recorded(tiny: Callable[..., Config]) -> Callable[..., Path]:
         truncated: int = 0,
         steps: int = 160,
         outcome: str = "finished",
+        updates: int = 0,
     ) -> Path:
         config = tiny(*overrides)
+        counts: dict[str, float] = {"updates": updates, "flops": updates * (flops or 0)} if updates else {}
         game = facts_of(config.game)
         folder = RunFolder.of(config)
         journal = Journal(folder.path)
         folder.write_config(to_dict(config))
         if flops is not None:
             journal.tags({"flops_per_update": str(flops)})
-        for frames, hours, updates, score in curve:
-            point = {"throughput/frames": frames, "throughput/hours": hours, "learning/updates": updates}
+        for frames, hours, learned, score in curve:
+            point = {"throughput/frames": frames, "throughput/hours": hours, "learning/updates": learned}
             journal.metrics({**point, "score/mean_100": score, "actions/epsilon": 0.5}, int(frames) // 3)
         episodes = [
             Episode(
@@ -277,7 +279,7 @@ def recorded(tiny: Callable[..., Config]) -> Callable[..., Path]:
         evaluation = Evaluation(config.evaluation.epsilon, episodes, game)
         journal.artifact(evaluation_at(steps), evaluation.table().to_csv().encode())
         journal.finish()
-        folder.write_result(Result(outcome, steps, {}, evaluation.metrics(), evaluation.report()))
+        folder.write_result(Result(outcome, steps, counts, evaluation.metrics(), evaluation.report()))
         return folder.path
 
     return record

@@ -288,7 +288,7 @@ def test_without_a_terminal_a_line_now_and_then_says_how_far_a_training_is(monke
                 recorder.episode(Played(number + 1, counters.steps, 0, score, 1_000 + 10 * number, 0))
             counters.episodes = len(scores)
         if look == 5:
-            recorder._max_steps = 3_500
+            recorder._last_step = 3_500
         recorder.show(counters)
     assert text.getvalue().splitlines() == [
         "episode 1  first episode  epsilon 0.46  step 1,000  "

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from atlantis_exp.checking import digest
 from atlantis_exp.commands.app import Asked
-from atlantis_exp.commands.overrides import check, read_flags, read_override
+from atlantis_exp.commands.overrides import check, flags_of, read_flags, read_override
 from atlantis_exp.config import FREE, Config
 from atlantis_exp.sessions.job import Job
 
@@ -50,4 +50,5 @@ def words_of(overrides: Sequence[str]) -> tuple[str, ...]:
 def training_of(overrides: Sequence[str]) -> Job:
     """Return the training of some overrides. Raises: ConfigError."""
     ((texts, config),) = check("config", Config, overrides).items()
-    return job_of(Asked(config, "train", texts))
+    own = flags_of(overrides).config_dir
+    return job_of(Asked(config, "train", (f"--config-dir={own}", *texts) if own else texts))

@@ -6,7 +6,7 @@ from functools import partial
 
 from atlantis_exp.commands.app import Asked, Verb, in_turn
 from atlantis_exp.commands.jobs import job_of
-from atlantis_exp.commands.overrides import swept
+from atlantis_exp.commands.overrides import key_of, read_flags, swept
 from atlantis_exp.config import Config
 from atlantis_exp.sessions.job import command_line
 from atlantis_exp.sessions.launchers import Launcher
@@ -19,12 +19,16 @@ def _work(asked: Asked[Config]) -> Callable[[], object]:
 
 
 def _sweep(asked: Sequence[Asked[Config]], launcher: Launcher, arguments: Sequence[str]) -> None:
-    from atlantis_exp.sessions.sweep import ledger
-
     if len(asked) == 1 and launcher.is_basic:
         in_turn(_work, asked)
         return
+    from atlantis_exp.sessions.launchers.joblib import fitting
+    from atlantis_exp.sessions.sweep import ledger, say_hours
+
     jobs = [job_of(each) for each in asked]
+    if not any(key_of(text) == "hydra/launcher" for text in read_flags(arguments)[0]):
+        launcher = fitting(jobs, len(jobs))
+        say_hours(jobs, launcher)
     with ledger(jobs, swept(arguments), launcher, command_line(*arguments)):
         match launcher.name:
             case "joblib":

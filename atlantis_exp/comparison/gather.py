@@ -94,7 +94,7 @@ class StoredRun(Run):
 class Training(Run):
     """A finished training, with its learning curve and its evaluation after the last step.
 
-    Its config has the epsilon of that evaluation, and a budget only if it ended the training.
+    Its config has the epsilon of that evaluation, and those limits of a budget that ended the training.
     """
 
     science: dict[str, Any]  # the dotted keys that decide its numbers
@@ -261,7 +261,7 @@ def _training(run: StoredRun, config: Config, epsilon: float | None) -> Training
     if folder.result is None:
         state = f"failed: {folder.error}" if folder.state == "failed" else "unfinished"
         raise _Unusable(f"{state}: the command that started it continues it")
-    if (result := folder.ended(config.budget.steps)) is None:
+    if (result := folder.ended(config.budget.limits)) is None:
         raise _Unusable("unfinished: it was made longer; the command that did so continues it")
     at_end = [each for each in run.evaluations if each.step == result.steps and each.path.exists()]
     if not (taken := [each for each in at_end if epsilon in (None, each.epsilon)]):
@@ -272,10 +272,10 @@ def _training(run: StoredRun, config: Config, epsilon: float | None) -> Training
     is_filmed = not is_own or run.tags.get("best_evaluation", "").endswith(f" at step {result.steps}")
     science = config.science()
     science["phase"] = {str(index): phase for index, phase in enumerate(science["phase"])}
-    budget = config.budget.steps if result.outcome == "budget" else None
+    spent = result.spent(config.budget.limits) if result.outcome == "budget" else {}
     return Training(
         folder.name,
-        run.config | {"evaluation.epsilon": latest.epsilon, "budget.steps": budget},
+        run.config | {"evaluation.epsilon": latest.epsilon, "budget.steps": None, "budget.flops": None} | spent,
         run.tags,
         science=flatten(science),
         curve=_curve(folder.path, run.tags),

@@ -1,6 +1,7 @@
 """Say what a reader must know before believing a comparison: a function a subject, which yields its lines or none."""
 
 import json
+import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,6 +29,10 @@ from atlantis_exp.comparison.words import IN_FULL, listed, margin, measure, spen
 from atlantis_exp.components import Component, facts_of
 from atlantis_exp.runs.folder import LOST
 from atlantis_exp.terminal import PROGRAM
+
+_LENGTH = re.compile(r"phase\.\d+\.(episodes|steps)")
+_SHARES = {"frames": "{:,.0f} frames", "hours": "{:.2f} hours", "flops": "{:.3g} FLOPs"}  # by axis
+_NAMED = 6  # runs, up to which a line names them
 
 
 @dataclass(frozen=True)
@@ -210,10 +215,8 @@ def unlike(facts: Facts) -> Iterator[str]:
             lambda run: f"{run.episodes.scores.size:,}"
         ),
     }
-    if "budget.steps" not in facts.by:
-        subjects["not trained equally long"] = lambda run: (
-            f"budget.steps={most:,}" if (most := run.config["budget.steps"]) else "the whole plan"
-        )
+    if not {"budget.steps", "budget.flops"} & set(facts.by):
+        subjects["not trained equally long"] = _ended_by
     for how, value in subjects.items():
         holders = defaultdict(list)
         for run in runs:
@@ -221,6 +224,13 @@ def unlike(facts: Facts) -> Iterator[str]:
         if len(holders) > 1:
             named = "; ".join(f"{value}: {listed(names)}" for value, names in sorted(holders.items()))
             yield f"The runs were {how}: {named}."
+
+
+def _ended_by(run: Training) -> str:
+    """Return what ended a training, as a user writes it."""
+    steps, flops = run.config["budget.steps"], run.config.get("budget.flops")
+    limits = [f"budget.steps={steps:,}"] if steps else []
+    return " ".join([*limits, f"budget.flops={flops:g}"] if flops else limits) or "the whole plan"
 
 
 def lossy(facts: Facts) -> Iterator[str]:
@@ -331,6 +341,24 @@ def mixed(facts: Facts) -> Iterator[str]:
         yield f"The groups also differ in {_values(between)}."
 
 
+def equal_shares(facts: Facts) -> Iterator[str]:
+    """Say whether all runs were trained for equal steps, episodes or arithmetic, and what a run took of the others."""
+    runs = facts.trainings
+    (ended, *others) = dict.fromkeys(map(_ended_by, runs))
+    phases = {tuple((key, run.science[key]) for key in sorted(run.science) if _LENGTH.fullmatch(key)) for run in runs}
+    if others or len(facts.groups) < 2 or (ended == "the whole plan" and len(phases) > 1):
+        return
+    share = "arithmetic" if "budget.flops" in ended else "steps"
+    if "budget" not in ended and any(key.endswith("episodes") and value for key, value in phases.pop()):
+        share = "episodes"
+    took = []
+    for label, trained in facts.groups.items():
+        ends = {axis: [run.curve[axis][-1] for run in trained if axis in run.curve] for axis in AXES}
+        each = [_SHARES[axis].format(fmean(values)) for axis, values in ends.items() if values]
+        took.append(f"{label} {', '.join(each)}")
+    yield f"The runs were trained for equal {share} ({ended}). On average a run took: {'; '.join(took)}."
+
+
 def begun(facts: Facts) -> Iterator[str]:
     """Name the weights that trainings began with."""
     for label, runs in facts.groups.items():
@@ -397,7 +425,7 @@ CAVEATS: Sequence[Note] = (
 """What may make a verdict mean something else."""
 
 NOTES: Sequence[Note] = (
-    *(in_training, mixed, begun, survival_and_rate),
+    *(in_training, equal_shares, mixed, begun, survival_and_rate),
     *(capped, measured_players, random_player),
 )
 """What is said after it."""

@@ -1,6 +1,7 @@
 """Run folders: their places, files, holders and results."""
 
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -49,7 +50,7 @@ class Result:
 
     outcome: str
     steps: Natural
-    counts: dict[str, float]  # episodes, frames, updates and hours of a training
+    counts: dict[str, float]  # episodes, frames, updates, FLOPs of updates and hours of a training
     evaluation: dict[str, float]  # empty where there was none
     report: str
     evaluated_at: Natural | None = None  # step of the last evaluation, if that was before the last one
@@ -57,6 +58,11 @@ class Result:
     def __post_init__(self) -> None:
         if self.evaluation and (missing := EVALUATED - self.evaluation.keys()):
             raise ValueError(f"its evaluation lacks {min(missing)}")
+
+    def spent(self, limits: Mapping[str, float]) -> dict[str, float]:
+        """Return those of a budget's limits that the training has reached."""
+        done = {"budget.steps": self.steps, "budget.flops": self.counts.get("flops", 0)}
+        return {key: limit for key, limit in limits.items() if done[key] >= limit}
 
 
 @dataclass(frozen=True)
@@ -111,11 +117,26 @@ class RunFolder:
         """How the run ended; None also while it is made longer, when `result` is an earlier end."""
         return self.result if self.state == "done" else None
 
-    def ended(self, budget: int | None) -> Result | None:
-        """Return the result of an ended run, None if it can go on, as after its budget of steps was raised."""
+    def ended(self, limits: Mapping[str, float]) -> Result | None:
+        """Return the result of an ended run, None if it can go on, as after its budget was raised."""
         if not self.has_started or (result := self.result) is None:
             return None
-        return None if result.outcome == "budget" and (budget is None or budget > result.steps) else result
+        return None if result.outcome == "budget" and not result.spent(limits) else result
+
+    def beyond(self, limits: Mapping[str, float]) -> tuple[str, str] | None:
+        """Return the limit that the run was trained beyond and what it was trained for; None where it was not."""
+        if (result := self.result) is None:
+            return None
+        config = self.trained_config
+        # All environments step at once, and the updates that fall due with their steps are made at once.
+        updates = math.ceil(config.env.num_envs / config.training.learn_every)
+        steps, most = limits.get("budget.steps"), limits.get("budget.flops")
+        if steps is not None and result.steps - config.env.num_envs >= steps:
+            return f"budget.steps={steps}", f"{result.steps:,} steps"
+        flops, done = result.counts.get("flops", 0), result.counts.get("updates", 0)
+        if most is not None and flops and flops * (1 - updates / done) >= most:
+            return f"budget.flops={most:g}", f"{flops:.4g} FLOPs"
+        return None
 
     def put_aside(self) -> Path:
         """Rename the folder to make room for a new run; return its new place. Raises: Fault while held."""

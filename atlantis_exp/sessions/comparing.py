@@ -145,6 +145,9 @@ def _recipes(runs: Sequence[Training]) -> list[str]:
     evaluation.seed=${seed} each further seed would otherwise make another comparison, without the looks taken before.
     """
     recipes = [run.science | {key: run.config[key] for key in ("budget.steps", "evaluation.epsilon")} for run in runs]
+    for recipe, run in zip(recipes, runs, strict=True):
+        if (flops := run.config.get("budget.flops")) is not None:  # else an older comparison stays itself
+            recipe["budget.flops"] = flops
     seeds = {run.config["seed"] for run in runs}
 
     def follows(key: str) -> bool:

@@ -6,7 +6,6 @@ moment, the same command goes on where it was.
 
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -15,10 +14,8 @@ from math import sqrt
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 
 from atlantis_exp import terminal
-from atlantis_exp.build import build_trainer
 from atlantis_exp.checking import digest, flatten, to_dict
 from atlantis_exp.comparison.choosing import mixed_protocol, resolve, shortened, values_in
 from atlantis_exp.comparison.decision import detectable, equivalence, looks_up_to
@@ -30,17 +27,16 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import Journal, Tracker
+from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.comparing import Choice, compare
 from atlantis_exp.sessions.job import Job, command_line, labels, quoted, replaced
+from atlantis_exp.sessions.launchers import BASIC, Launcher
+from atlantis_exp.sessions.launchers.joblib import fitting, train_side_by_side
 from atlantis_exp.sessions.page import opened, terminable
-from atlantis_exp.sessions.processor import set_up_torch
-from atlantis_exp.sessions.sweep import ledger
-from atlantis_exp.sessions.training import expected, train
+from atlantis_exp.sessions.sweep import hours_of, how_many, ledger
+from atlantis_exp.sessions.training import train
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.training.forecast import duration
-from atlantis_exp.training.plan import Counters
-from atlantis_exp.training.progress import Progress
 
 
 class Contest:
@@ -50,7 +46,7 @@ class Contest:
         chosen: the overrides of each contender that tell it from the others.
         several: the overrides with several values, as typed; none: the contenders are no such product.
         fixed: the overrides that all contenders share.
-        launcher: the overrides that choose what runs the trainings; none: this process, one by one.
+        launcher: the overrides that choose what runs the trainings; none: as many at a time as the machine runs well.
         job_of: the training that overrides make.
         command: what continues it.
 
@@ -118,12 +114,19 @@ class Contest:
             "budget.steps": self.config.budget.steps,
             "evaluation.epsilon": self.config.evaluation.epsilon,
         }
+        if self.config.budget.flops is not None:  # an older decision names none
+            identity["budget.flops"] = self.config.budget.flops
         return RunFolder(self.outputs / "decisions" / f"decide-{digest(identity)}")
 
     @property
     def looks(self) -> tuple[int, ...]:
         """The planned looks: numbers of seeds a contender."""
         return looks_up_to(self.question.seeds)
+
+    @cached_property
+    def here(self) -> Launcher:
+        """What runs the trainings on this machine if no launcher is chosen; not asked again amid the decision."""
+        return fitting([job for _, job in self.contenders.values()], len(self.contenders) * self.looks[0])
 
     @cached_property
     def runs(self) -> list[RunFolder]:
@@ -160,17 +163,13 @@ class Contest:
         return RunFolder.of(self.job(label, seed).config)
 
     def _has_ended(self, folder: RunFolder) -> bool:
-        return folder.ended(self.config.budget.steps) is not None
+        return folder.ended(self.config.budget.limits) is not None
 
     def _refuse_longer_runs(self) -> None:
-        if (steps := self.config.budget.steps) is None:
-            return
         for folder in self.runs:
-            # All environments step at once, so that the last of these steps may end beyond the budget.
-            result = folder.result
-            if result is not None and result.steps - folder.trained_config.env.num_envs >= steps:
+            if (longer := folder.beyond(self.config.budget.limits)) is not None:
                 raise ConfigError(
-                    f"budget.steps={steps}: run {folder.name} was trained for {result.steps:,} steps; ask for as many, "
+                    f"{longer[0]}: run {folder.name} was trained for {longer[1]}; ask for as many, "
                     "or for other paths.outputs"
                 )
 
@@ -225,8 +224,10 @@ def _said(overrides: Sequence[str]) -> str:
     return " ".join(overrides) or "the config without it"
 
 
-def decide(contest: Contest, train: Callable[[Job], int | None] = train) -> None:
+def decide(contest: Contest, trained: Callable[[Job], int | None] | None = None) -> None:
     """Train the contenders' seeds in the order of the plan, look, drop what is decided, and say the answer.
+
+    trained: trains a job in this process, one after the other; None: as many at a time as the machine runs well.
 
     Raises:
         Fault: a training fails; the same command goes on.
@@ -247,7 +248,7 @@ def decide(contest: Contest, train: Callable[[Job], int | None] = train) -> None
                 if not (needed := contest.needed(comparison)):
                     break
                 try:
-                    _train(contest, needed, train)
+                    _train(contest, needed, trained)
                 except Fault as fault:
                     raise Fault(f"{fault}; {again}", fault.exit_code) from fault
     except (SystemExit, KeyboardInterrupt) as ended:
@@ -258,7 +259,7 @@ def decide(contest: Contest, train: Callable[[Job], int | None] = train) -> None
         terminal.document(comparison.document("decide").model_dump_json())
 
 
-def _train(contest: Contest, needed: Mapping[str, Sequence[int]], train: Callable[[Job], int | None]) -> None:
+def _train(contest: Contest, needed: Mapping[str, Sequence[int]], trained: Callable[[Job], int | None] | None) -> None:
     if contest.launcher:
         for arguments in contest.sweeps(needed):
             with subprocess.Popen([sys.executable, "-m", "atlantis_exp", *arguments]) as sweep:
@@ -270,11 +271,14 @@ def _train(contest: Contest, needed: Mapping[str, Sequence[int]], train: Callabl
             if code:
                 raise Fault(f"a sweep ended with exit code {code}", exit_code=code if code > 0 else 128 - code)
     else:
-        jobs = contest.jobs(needed)
-        with ledger(jobs, contest.several, command=contest.command):
-            for job in jobs:
-                if (late := train(job)) is not None:
-                    sys.exit(128 + late)
+        jobs, launcher = contest.jobs(needed), BASIC if trained else contest.here
+        with ledger(jobs, contest.several, launcher, contest.command):
+            if not launcher.is_basic:
+                train_side_by_side(jobs, launcher)
+            else:
+                for job in jobs:
+                    if (late := (trained or train)(job)) is not None:
+                        sys.exit(128 + late)
     for label, seeds in needed.items():
         for seed in contest.left(label, seeds):
             raise Fault(f"run {contest.run(label, seed).name} has not ended")
@@ -290,14 +294,19 @@ def say_what_it_takes(contest: Contest) -> None:
         f"{', '.join(contest.contenders)}: {fewest}{count * looks[-1]} runs, looks at "
         f"{' and '.join(map(str, looks))} seeds each; {count * looks[-1] - sum(missing.values())} are there."
     )
-    hours = 0.0
+    launcher, hours = BASIC if contest.launcher else contest.here, 0.0
+    cores = launcher.settings.get("cores")
+    if not contest.launcher:
+        say(how_many(launcher))
     for label, runs in missing.items():
         if runs and contest.config.budget.forecast != "off":
-            forecast = _forecast(contest.job(label, 0))
+            forecast = hours_of(contest.job(label, 0), cores)
             hours += runs * forecast
-            say(f"{label}: {duration(forecast)} a run, alone on this machine")
+            say(f"{label}: {duration(forecast)} a run, {'on its share' if cores else 'alone on this machine'}")
     if hours:
-        say(f"at most {duration(hours)} where they run one after the other, evaluations not counted")
+        at_once = launcher.settings.get("n_jobs", 1)
+        how = "so many at a time" if at_once > 1 else "where they run one after the other"
+        say(f"at most {duration(hours / at_once)} {how}, evaluations not counted")
     if (known := _spread(contest)) is None:
         return
     spread, whence = known
@@ -311,16 +320,6 @@ def say_what_it_takes(contest: Contest) -> None:
             words += f", and no difference where delta is {least:.0f} % or more,"
         say(f"{words} with 80 % at {looks[-1]} seeds")
     say(f"(if a contender's seeds differ as {whence}: {100 * spread:.0f} % of their mean, standard deviation)")
-
-
-def _forecast(job: Job) -> float:
-    """Return the hours that a training takes here."""
-    config = job.config
-    set_up_torch(config, config.device)
-    with tempfile.TemporaryDirectory() as aside:
-        trainer = build_trainer(config, job.machine.cores, Path(aside), Tracker(), Progress(Console(quiet=True)))
-        with trainer.emulators:
-            return expected(trainer, config, Counters()).hours
 
 
 def _spread(contest: Contest) -> tuple[float, str] | None:

@@ -1,5 +1,6 @@
 """Show a sweep's runs while other processes train them: a table on a terminal, plain lines elsewhere."""
 
+import math
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -10,10 +11,12 @@ from rich.live import Live
 from rich.table import Table
 
 from atlantis_exp import terminal
+from atlantis_exp.config import Config
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder, State
-from atlantis_exp.runs.journal import Metrics, read, read_commit
+from atlantis_exp.runs.journal import Metrics, Tags, read, read_commit
 from atlantis_exp.sessions.job import Job
+from atlantis_exp.training.plan import step_of
 
 _ORDER: tuple[State, ...] = ("running", "failed", "interrupted", "done", "queued")
 
@@ -23,6 +26,7 @@ class _Run:
     """A run as of its last commit; only the new part of its journal is read."""
 
     title: str
+    config: Config
     folder: RunFolder
     length: int  # of the plan, in its unit
     unit: str
@@ -44,7 +48,16 @@ class _Run:
             if isinstance(record, Metrics):
                 self.values |= record.values
                 self.step = record.step
+            elif isinstance(record, Tags) and "flops_per_update" in record.values:
+                self._end_at(float(record.values["flops_per_update"]))
         self._offset, self._updated = commit.offset, commit.updated
+
+    def _end_at(self, flops: float) -> None:
+        """Shorten a plan in steps to what budget.flops allows, given the FLOPs of an update."""
+        training, most = self.config.training, self.config.budget.flops
+        if self.unit == "steps" and most is not None and flops > 0:
+            last = step_of(math.ceil(most / flops), training.learn_start, training.learn_every)
+            self.length = min(self.length, last)
 
     @property
     def done(self) -> int:
@@ -125,4 +138,4 @@ def _run(job: Job, folder: RunFolder) -> _Run:
     length = sum(episodes or steps or 0 for episodes, steps in lengths)
     if unit == "steps" and config.budget.steps is not None:
         length = min(length, config.budget.steps)
-    return _Run(job.title, folder, length, unit)
+    return _Run(job.title, config, folder, length, unit)

@@ -14,6 +14,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import optuna
@@ -111,8 +112,14 @@ class Trials:
 
     def __init__(self, asked: Search, train: Train = train) -> None:
         config = asked.corner.config
-        facts = {"space": dict(asked.texts), "training": config.science(), "budget.steps": config.budget.steps}
-        if asked.seeds > 1:  # searches of older versions have no such key
+        facts: dict[str, Any] = {
+            "space": dict(asked.texts),
+            "training": config.science(),
+            "budget.steps": config.budget.steps,
+        }
+        if config.budget.flops is not None:  # an older search names none
+            facts["budget.flops"] = config.budget.flops
+        if asked.seeds > 1:  # nor this one
             facts["seeds"] = asked.seeds
         name = asked.name or f"search-{digest(facts)}"
         self.asked, self._train = asked, train
@@ -234,10 +241,10 @@ class Trials:
             raise TrialPruned
         if stopped:
             return None
-        result, most = run.result, config.budget.steps
+        result = run.result
         assert result is not None
-        if most is not None and result.steps >= most + config.env.num_envs:
-            raise Fault(f"run {run.name} was trained for {result.steps:,} steps already, more than budget.steps={most}")
+        if (longer := run.beyond(config.budget.limits)) is not None:
+            raise Fault(f"run {run.name} was trained for {longer[1]} already, more than {longer[0]}")
         return result.evaluation["evaluation/mean"]
 
     def job(self, trial: FrozenTrial | Trial, index: int) -> Job:
@@ -265,7 +272,7 @@ class Trials:
                 shared = _without(asked.overrides, "seed", "resume", "budget.wall_clock")
                 against = f"against={','.join(_values(best))}"
                 lines.append(f"Better than the default? {command_line('decide', *shared, against)}")
-        full = _without(job.overrides, "budget.steps", "budget.wall_clock")
+        full = _without(job.overrides, "budget.steps", "budget.flops", "budget.wall_clock")
         return [*lines, f"The best in full: {command_line(*full)}"]
 
     def describe(self, journal: Journal) -> None:

@@ -2,24 +2,35 @@
 
 import csv
 import io
+import tempfile
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, nullcontext, suppress
+from dataclasses import replace
 from functools import partial
+from math import ceil
 from pathlib import Path
 from typing import Any, get_args
 
+from rich.console import Console
+
 from atlantis_exp import terminal
+from atlantis_exp.build import build_trainer
 from atlantis_exp.checking import digest
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import TABLE_COLUMNS, TRACEBACK, RunFolder, State
-from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, adopt
+from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, Tracker, adopt
 from atlantis_exp.sessions.job import Job, fitted
 from atlantis_exp.sessions.launchers import BASIC, Launcher
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.page import ending, opened, terminable
+from atlantis_exp.sessions.processor import set_up_torch
+from atlantis_exp.sessions.training import expected
 from atlantis_exp.tracking.publishing import catch_up
+from atlantis_exp.training.forecast import duration
+from atlantis_exp.training.plan import Counters
+from atlantis_exp.training.progress import Progress
 
 _PAGE_SECONDS = 60.0  # between two looks at the runs while they are trained
 
@@ -53,6 +64,41 @@ def ledger(
             yield
     finally:
         _print_table(runs)
+
+
+def say_hours(jobs: Sequence[Job], launcher: Launcher) -> None:
+    """Print how many of a sweep's jobs are trained at a time, and the hours that all take if they are as the first."""
+    left = [job for job in jobs if RunFolder.of(job.config).ended(job.config.budget.limits) is None]
+    if not left:
+        return
+    at_once = min(launcher.settings.get("n_jobs", 1), len(left))
+    hours = ""
+    if left[0].config.budget.forecast != "off":
+        each = hours_of(left[0], launcher.settings.get("cores"))
+        hours = f": about {duration(each * ceil(len(left) / at_once))} if all take as long as {left[0].title}"
+    print(f"{how_many(launcher)}{hours}", flush=True)
+
+
+def how_many(launcher: Launcher) -> str:
+    """Say how many trainings go on at a time."""
+    if launcher.is_basic:
+        return "one training after the other"
+    cores = launcher.settings["cores"]
+    return f"{launcher.settings['n_jobs']} trainings at a time, {cores} {'core' if cores == 1 else 'cores'} each"
+
+
+def hours_of(job: Job, cores: int | None = None) -> float:
+    """Return the hours that a training takes here with so many cores; None: with this process's."""
+    config = replace(job.config, threads=job.config.threads or cores)
+    set_up_torch(config, config.device)
+    with (
+        tempfile.TemporaryDirectory() as aside,
+        terminal.working("measuring how fast it goes here"),
+    ):
+        progress = Progress(Console(quiet=True))
+        trainer = build_trainer(config, cores or job.machine.cores, Path(aside), Tracker(), progress)
+        with trainer.emulators:
+            return expected(trainer, config, Counters()).hours
 
 
 def _print_table(runs: Runs) -> None:

@@ -102,7 +102,7 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
         print(f"the run that was here is kept as {folder.put_aside()}")
         if parent is not None:
             adopt(folder.path, parent)
-    if (result := folder.ended(config.budget.steps)) is None:
+    if (result := folder.ended(config.budget.limits)) is None:
         if folder.has_lost_checkpoints:
             raise Fault(
                 f"run {folder.name}: its checkpoints are gone from {folder.checkpoints}: put them back, or begin anew "
@@ -111,8 +111,10 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
         return False
     how = f"{result.outcome} after {result.steps:,} steps"
     print(f"run {folder.name} has ended ({how}):\n\n{result.report}")
-    if result.outcome == "finished" and (config.budget.steps or 0) > result.steps:
-        print(f"\nbudget.steps={config.budget.steps} adds nothing to a plan that is over. {_begin_with(job, folder)}")
+    limits = config.budget.limits
+    unspent = [f"{key}={limit}" for key, limit in limits.items() if key not in result.spent(limits)]
+    if result.outcome == "finished" and unspent:
+        print(f"\n{' '.join(unspent)} adds nothing to a plan that is over. {_begin_with(job, folder)}")
     return True
 
 
@@ -156,11 +158,9 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
         # Before there is anything to publish: MLflow's import at the same time took three quarters of the speed.
         _check_forecast(trainer, config, done, progress)
     if state is None:
-        env = config.env
-        flops = trainer.learner.update_flops((env.stack, env.size, env.size), config.training.batch_size)
         journal.params({key: str(value) for key, value in flatten(to_dict(config)).items()})
         journal.artifact(CONFIG, (folder.path / CONFIG).read_bytes())
-        journal.tags({"flops_per_update": str(flops)})
+        journal.tags({"flops_per_update": str(trainer.flops_per_update)})
     else:
         with unforged(folder.checkpoints), terminal.working("playing the games up to where they were"):
             trainer.load_state_dict(state)
@@ -203,7 +203,7 @@ def _any_length(science: Mapping[str, Any]) -> dict[str, Any]:
 def _begin_with(job: Job, folder: RunFolder) -> str:
     """Say by which commands a training begins with a run's weights."""
     weights = f"pretrained/{folder.name}"
-    own = [text for text in job.overrides if not text.startswith("budget.steps=")]
+    own = [text for text in job.overrides if not text.startswith(("budget.steps=", "budget.flops="))]
     export = command_line("export", f"run={folder.name}", f"to={weights}", f"paths.outputs={job.outputs}")
     begin = command_line(*replaced(own, f"training.weights={weights}"))
     return f"To begin a training with its weights:\n  {export}\n  {begin}"
@@ -256,6 +256,7 @@ def _close(trainer: Trainer, folder: RunFolder, journal: Journal, outcome: Outco
         "episodes": counters.episodes,
         "frames": counters.frames,
         "updates": trainer.learner.updates,
+        "flops": trainer.learner.updates * trainer.flops_per_update,
         "hours": counters.seconds / 3600,
     }
     report = recorder.last_report or "no evaluation (evaluation.at_end=false)"

@@ -105,7 +105,7 @@ def forecast(trainer: Trainer, *, capacity: int, max_bytes: int, size: int, stac
     epsilon = statistics.fmean(plan.epsilon(progress, int(progress * length)) for progress in np.linspace(0, 1, 101))
     acts = 1 - epsilon**num_envs  # share of the iterations in which any environment asks the network
     seconds_a_step = (play_seconds + acts * act_seconds) / num_envs + update_seconds / plan.learn_every
-    steps = max(1, (length if trainer.max_steps is None else min(length, trainer.max_steps)) - done.steps)
+    steps = max(1, (length if trainer.last_step is None else min(length, trainer.last_step)) - done.steps)
     an_observation = memory.nbytes / (memory.next_id - memory.oldest_id)  # bytes
     replay_bytes = int(min(max_bytes, min(capacity, done.steps + steps) * an_observation))
     loaded = trainer.memory.next_id - trainer.memory.oldest_id  # observations, of a run that goes on

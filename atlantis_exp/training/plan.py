@@ -104,6 +104,11 @@ class Cadence:
     final_episodes: int  # of the one at its end
 
 
+def step_of(updates: int, learn_start: int, learn_every: int) -> int:
+    """Return the step at which about so many updates have been made."""
+    return learn_start + updates * learn_every
+
+
 def passed(every: int | None, before: int, now: int) -> bool:
     """Tell whether a multiple of `every` lies in (before, now]; False for None."""
     return every is not None and now // every > before // every

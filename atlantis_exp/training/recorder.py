@@ -85,13 +85,13 @@ class Recorder:
         self.last_report = ""  # of the latest evaluation
         self.last_metrics: dict[str, float] = {}  # of the latest evaluation
         self._pace = Pace()
-        self._max_steps: int | None = None
+        self._last_step: int | None = None
 
-    def begin(self, counters: Counters, max_steps: int | None) -> None:
+    def begin(self, counters: Counters, last_step: int | None) -> None:
         """Begin a session, before its first step."""
         self._pace = Pace()
         self._pace.tick(counters.steps)
-        self._max_steps = max_steps
+        self._last_step = last_step
         self._describe("running", counters)
 
     def end(self, counters: Counters, outcome: str) -> None:
@@ -264,8 +264,8 @@ class Recorder:
     def _snapshot(self, counters: Counters) -> Snapshot:
         done, length = self.plan.done(counters), self.plan.length
         left = counters.steps * (length - done) / done if done else None
-        if left is not None and self._max_steps is not None:
-            left = min(left, self._max_steps - counters.steps)
+        if left is not None and self._last_step is not None:
+            left = min(left, self._last_step - counters.steps)
         return Snapshot(
             episode=counters.episodes + 1,
             scores=self.recent_scores(20),

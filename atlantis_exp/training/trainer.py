@@ -1,8 +1,10 @@
 """The training loop (report figure 3.1), as a page that reads like it."""
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -16,7 +18,7 @@ from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.replay.samplers import Draw, Sampler
 from atlantis_exp.training.actor import Actor, Decisions
 from atlantis_exp.training.checkpoint import Checkpoints
-from atlantis_exp.training.plan import Counters, Plan, passed
+from atlantis_exp.training.plan import Counters, Plan, passed, step_of
 from atlantis_exp.training.recorder import Played, Recorder
 
 Outcome = Literal["finished", "budget", "interrupted"]
@@ -42,6 +44,7 @@ class Trainer:
     recorder: Recorder
     checkpoints: Checkpoints
     max_steps: int | None
+    max_flops: float | None = None
 
     def __post_init__(self) -> None:
         self.counters = Counters()
@@ -123,18 +126,40 @@ class Trainer:
             if not self.memory.is_under_way(env):  # the episode's beginning was lost
                 self.memory.begin(env, self.stack.state[env, -1])
 
+    @cached_property
+    def flops_per_update(self) -> int:
+        """The floating-point operations of one update."""
+        _, stack, height, width = self.stack.state.shape
+        return self.learner.update_flops((stack, height, width), self.plan.batch_size)
+
+    @cached_property
+    def max_updates(self) -> int | None:
+        """The fewest updates that cost `max_flops`."""
+        return None if self.max_flops is None else -(-math.ceil(self.max_flops) // self.flops_per_update)
+
     @property
     def has_ended(self) -> bool:
         """Whether the plan or the budget is used up."""
-        budget_spent = self.max_steps is not None and self.counters.steps >= self.max_steps
-        return budget_spent or self.plan.done(self.counters) >= self.plan.length
+        return (
+            (self.max_steps is not None and self.counters.steps >= self.max_steps)
+            or (self.max_updates is not None and self.learner.updates >= self.max_updates)
+            or self.plan.done(self.counters) >= self.plan.length
+        )
+
+    @property
+    def last_step(self) -> int | None:
+        """The step at which the budget will end the training, about; None without a budget."""
+        plan, steps = self.plan, [] if self.max_steps is None else [self.max_steps]
+        if self.max_updates is not None:
+            steps.append(step_of(self.max_updates, plan.learn_start, plan.learn_every))
+        return min(steps, default=None)
 
     def _begin(self, stop: Callable[[], bool]) -> None:
         if self.memory.next_id == 0:
             self._begin_episodes(range(self.emulators.num_envs), self.seeds)
         self._session_start = time.monotonic() - self.counters.seconds
         self._last_commit = time.monotonic()
-        self.recorder.begin(self.counters, self.max_steps)
+        self.recorder.begin(self.counters, self.last_step)
         if self.recorder.evaluation_pending:
             self._evaluate(stop)
 

@@ -21,6 +21,7 @@ from benchmarks import (
     overhead,
     pace,
     replay,
+    side_by_side,
     startup,
     store,
     time_to_score,
@@ -164,6 +165,14 @@ def test_the_flops_of_an_update_are_those_of_its_layers() -> None:
 def test_overhead_tells_the_share_of_tracking(capsys: pytest.CaptureFixture[str]) -> None:
     results = results_of(overhead.main, "--rounds 1 --seconds 1 --commit-seconds 0.5", capsys)
     assert 0 < results["tracking_share"] < 1
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1_200)
+def test_side_by_side_tells_how_many_more_seeds_an_hour_are_trained(capsys: pytest.CaptureFixture[str]) -> None:
+    results = results_of(side_by_side.main, "--rounds 1 --seconds 1 --seeds 2 model=cnn_small", capsys)
+    assert results["at_once"] in (1, 2)
+    assert results["seeds_an_hour"] > 0
 
 
 @pytest.mark.slow

@@ -127,6 +127,10 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("paths.outputs=/dev/null", "paths.outputs=/dev/null: /dev/null is not a folder", "as in paths.outputs=./outputs"),
     ("paths.outputs=/dev/null/x", "/dev/null is not a folder", "as in paths.outputs=./outputs"),
     ("paths.outputs=/", "paths.outputs=/: the root", "as in paths.outputs=./outputs"),
+    ("budget.flops=0", "budget.flops=0: should be greater than 0", ""),
+    ("budget.flops=-1e9", "budget.flops=-1000000000.0: should be greater than 0", ""),
+    ("budget.flops=nan", "budget.flops=NaN: should be a finite number", ""),
+    ("budget.flops=abc", "budget.flops=", "should be a valid number"),
     ("budget.wall_clock=abc", "budget.wall_clock=abc: not a duration", "use 90s, 10min or 3h"),
     ("paths.outputs=null", "paths.outputs", "valid string"),
     # one key against another

@@ -168,6 +168,9 @@ def test_only_a_budget_that_ended_its_training_is_one_of_the_run(recorded: Recor
     recorded("model=cnn", "budget.steps=160", outcome="budget")
     recorded("model=resnet", "budget.steps=900")
     assert [run.config["budget.steps"] for run in gather(tmp_path).trainings] == [160, None]
+    recorded("model=cnn_small", "budget.flops=3e3", "budget.steps=900", outcome="budget", updates=30)
+    ends = [(run.config["budget.steps"], run.config["budget.flops"]) for run in gather(tmp_path).trainings]
+    assert ends == [(160, None), (None, 3_000), (None, None)]
 
 
 def test_a_run_without_flops_has_no_such_curve(recorded: Recorded, tmp_path: Path) -> None:
@@ -200,6 +203,11 @@ def test_a_run_that_is_being_made_longer_does_not_count(recorded: Recorded, tmp_
     gathered = gather(tmp_path)
     assert gathered.trainings == []
     assert gathered.skipped[folder.name].startswith("unfinished: it was made longer")
+
+
+def test_a_run_that_ended_before_its_arithmetic_was_spent_does_not_count(recorded: Recorded, tmp_path: Path) -> None:
+    folder = RunFolder(recorded("budget.flops=3001", outcome="budget", updates=30))  # of 100 FLOPs each
+    assert gather(tmp_path).skipped[folder.name].startswith("unfinished: it was made longer")
 
 
 def test_players_are_there_whichever_trainings_are_asked_for(recorded: Recorded, tmp_path: Path) -> None:

@@ -20,10 +20,12 @@ from atlantis_exp.commands.decide import DecideConfig, contest_of
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.machine import all_cores
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import NOTE, Tags, read_commit
 from atlantis_exp.sessions.deciding import Contest, decide, say_what_it_takes
 from atlantis_exp.sessions.job import Job, replaced
+from atlantis_exp.sessions.launchers import BASIC, Launcher
 
 REPOSITORY = Path(__file__).parents[2]
 # Networks so young hold one action: seeds differ since each plays other games, with half of the decisions random.
@@ -43,7 +45,7 @@ def asking(tiny_overrides: tuple[str, ...], tmp_path: Path) -> Asking:
     """A decision as a command line asks for it: `asking("model=cnn,resnet")`."""
 
     def asked(*words: str) -> Contest:
-        typed = tuple(replaced(tiny_overrides, f"paths.outputs={tmp_path}", *words))
+        typed = tuple(replaced(replaced(tiny_overrides, f"paths.outputs={tmp_path}"), *words))
         ((texts, config),) = check("decide", DecideConfig, DECIDE.rewrite([*typed])).items()
         return contest_of(Asked(config, "decide", texts, typed=typed))
 
@@ -86,6 +88,7 @@ def test_contenders_are_trained_level_until_a_look_decides_and_compare_says_the_
     asking: Asking, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     contest = asking(*SHORT, CAPS)
+    contest.here = BASIC  # side by side they end in any order
     decide(contest)
     printed = capsys.readouterr().out
     labels = ["max_steps=100", "max_steps=900"]
@@ -246,6 +249,19 @@ def test_a_run_that_was_trained_longer_than_is_asked_is_no_seed_of_the_question(
         asking("model=cnn,resnet", "budget.steps=160")
 
 
+def test_contenders_are_asked_about_at_equal_arithmetic(asking: Asking, recorded: Recorded) -> None:
+    contest = asking("model=cnn,resnet", "budget.flops=3e3")
+    assert contest.folder != asking("model=cnn,resnet").folder
+    assert contest.folder == asking("model=cnn,resnet", "budget.flops=3000").folder
+    recorded("model=cnn", "seed=0", "budget.flops=3e3", outcome="budget", updates=30)  # of 100 FLOPs each
+    recorded("model=resnet", "seed=0", "budget.flops=2e3", outcome="budget", updates=20)
+    assert contest.needed(None)["cnn"] == [1, 2, 3, 4]
+    assert contest.needed(None)["resnet"] == [0, 1, 2, 3, 4]
+    longer = recorded("model=resnet", "seed=3", outcome="finished", updates=31)
+    with pytest.raises(ConfigError, match=f"^budget.flops=3000: run {longer.name} was trained for 3100 FLOPs; ask"):
+        asking("model=cnn,resnet", "budget.flops=3e3")
+
+
 @pytest.mark.slow
 def test_a_training_that_fails_ends_the_decision_in_one_line_that_says_how_it_goes_on(
     asking: Asking, recorded: Recorded
@@ -311,8 +327,10 @@ def test_before_it_starts_it_says_how_many_runs_there_may_be_and_what_they_can_f
     asking: Asking, recorded: Recorded, capsys: pytest.CaptureFixture[str]
 ) -> None:
     contest = asking("model=cnn,resnet_fast", "delta=5%")
+    contest.here = Launcher("joblib", {"n_jobs": 4, "cores": 2})
     assert said(contest, capsys).splitlines() == [
         "cnn, resnet_fast: 10 to 20 runs, looks at 5 and 10 seeds each; 0 are there.",
+        "4 trainings at a time, 2 cores each",
         "a difference of 12 % of the score is found, and no difference where delta is 14 % or more, with 80 % at 10 "
         "seeds",
         "(if a contender's seeds differ as published ones do (Dopamine's agents, five seeds): 9 % of their mean, "
@@ -324,13 +342,14 @@ def test_before_it_starts_it_says_how_many_runs_there_may_be_and_what_they_can_f
         recorded("model=cnn", f"seed={seed}", scores=(score, score, score, score))
     assert said(contest, capsys).splitlines() == [
         "cnn, resnet_fast: 10 to 20 runs, looks at 5 and 10 seeds each; 4 are there.",
+        "4 trainings at a time, 2 cores each",
         "a difference of 11 % of the score is found, and no difference where delta is 13 % or more, with 80 % at 10 "
         "seeds",
         "(if a contender's seeds differ as those that are there do: 8 % of their mean, standard deviation)",
     ]
     shown = said(asking("model=cnn,resnet_fast", "sampler=uniform,top_half", "seeds=5"), capsys).splitlines()
     assert shown[0].endswith("20 runs, looks at 5 seeds each; 4 are there.")
-    assert [line.partition(" is found")[0] for line in shown[1:-1]] == [
+    assert [line.partition(" is found")[0] for line in shown[2:-1]] == [
         "by model, a difference of 14 % of the score",
         "by sampler, a difference of 14 % of the score",
         "by model,sampler, a difference of 27 % of the score",
@@ -339,10 +358,17 @@ def test_before_it_starts_it_says_how_many_runs_there_may_be_and_what_they_can_f
 
 @pytest.mark.slow
 def test_before_it_starts_it_says_what_hours_the_runs_take(asking: Asking, capsys: pytest.CaptureFixture[str]) -> None:
-    shown = said(asking("model=cnn,resnet_fast", "budget.forecast=warn"), capsys)
+    contest = asking("model=cnn,resnet_fast", "budget.forecast=warn")
+    contest.here = BASIC
+    shown = said(contest, capsys)
+    assert "one training after the other" in shown
     assert re.search(r"^ *cnn: [\d,]+ (seconds|minutes) a run, alone on this machine", shown, re.MULTILINE)
     assert re.search(r"resnet_fast: [\d,]+ (seconds|minutes) a run, alone on this machine", shown)
     assert re.search(r"at most [\d,]+ (seconds|minutes) where they run one after the other", shown)
+    contest.here = Launcher("joblib", {"n_jobs": 4, "cores": 1})
+    shown = said(contest, capsys)
+    assert re.search(r"^ *cnn: [\d,]+ (seconds|minutes) a run, on its share", shown, re.MULTILINE)
+    assert re.search(r"at most [\d,]+ (seconds|minutes) so many at a time, evaluations not counted", shown)
 
 
 @pytest.mark.slow
@@ -360,6 +386,8 @@ def test_a_decision_that_was_killed_goes_on_and_ends_as_the_unbroken_one(
             assert process.poll() is None
             assert time.monotonic() < patience
             time.sleep(0.05)
+        if all_cores() > 1:
+            assert len([*runs.glob("*/output.txt")]) > 1  # of trainings side by side
         process.send_signal(sent)
         out, error = process.communicate()
         assert process.returncode == ended, out + error
@@ -395,13 +423,11 @@ def test_a_launcher_trains_what_the_decision_needs_with_a_sampler_from_a_file(
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)  # seconds
-def test_the_end_of_a_decision_has_its_launchers_jobs_commit(
-    deciding: Callable[..., subprocess.Popen[str]], tmp_path: Path
+@pytest.mark.parametrize("launcher", [(), ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")])
+def test_the_end_of_a_decision_has_its_jobs_commit(
+    deciding: Callable[..., subprocess.Popen[str]], tmp_path: Path, launcher: tuple[str, ...]
 ) -> None:
-    process = deciding(
-        *(CAPS, "phase.quick.steps=100_000", "tracking.commit_seconds=0.5"),
-        *("hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),
-    )
+    process = deciding(CAPS, "phase.quick.steps=100_000", "tracking.commit_seconds=0.5", *launcher)
     folder = tmp_path / "o" / "runs"
     patience = time.monotonic() + 200
     while not any(

@@ -22,7 +22,7 @@ from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal, read_commit
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.launchers import BASIC, Launcher
-from atlantis_exp.sessions.launchers.joblib import shared, train_side_by_side
+from atlantis_exp.sessions.launchers.joblib import fitted, fitting, shared, train_side_by_side
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.training import train
 from atlantis_exp.sessions.verifying import fingerprints
@@ -30,6 +30,8 @@ from atlantis_exp.sessions.verifying import fingerprints
 REPOSITORY = Path(__file__).parents[2]
 FREQUENT = ("tracking=mlflow", "tracking.commit_seconds=0.5", "evaluation.every_steps=null")
 LONG = (*FREQUENT, "phase.quick.steps=100_000")
+
+ROOMY = ("replay.capacity=900_000", "phase.quick.steps=900_000", "env.size=210")
 
 Compose = Callable[..., Config]
 Sweep = Callable[..., subprocess.Popen[bytes]]
@@ -118,6 +120,54 @@ def test_jobs_that_are_left_share_the_cores_of_the_machine(
     jobs = [Job(tiny(f"seed={seed}")) for seed in range(4)]
     recorded("seed=3")
     assert shared(8, n_jobs, jobs) == (at_once, share)
+
+
+@pytest.mark.parametrize(
+    ("words", "machine", "at_once", "cores"),
+    [
+        ((), (10, 2, 2, 64, False), 2, 1),
+        ((), (10, 16, 16, 64, False), 10, 1),
+        ((), (3, 16, 16, 64, False), 3, 5),
+        ((), (10, 16, 16, 64, True), 4, 4),
+        ((), (10, 1, 1, 64, False), 1, 1),
+        ((), (10, 16, 16, 5, False), 4, 4),  # memory for four
+        ((), (10, 16, 16, 1, False), 1, 16),
+        ((), (10, 16, 4, 64, False), 4, 4),  # OMP_NUM_THREADS=4
+        (("threads=4",), (10, 16, 16, 64, False), 4, 4),
+        (("env.workers=8",), (10, 16, 16, 64, False), 2, 8),
+        (("threads=32",), (10, 16, 16, 64, False), 1, 16),
+        ((*ROOMY, "replay.max_bytes=2_147_483_648"), (10, 16, 16, 16, False), 5, 3),
+        ((*ROOMY, "replay.max_bytes=268_435_456"), (10, 16, 16, 16, False), 10, 1),
+        ((*ROOMY, "replay.max_bytes=2_147_483_648", "budget.steps=999"), (10, 16, 16, 16, False), 10, 1),
+    ],
+)
+def test_as_many_trainings_go_on_at_a_time_as_the_machine_runs_well(
+    tiny: Compose, words: tuple[str, ...], machine: tuple[int, int, int, int, bool], at_once: int, cores: int
+) -> None:
+    planned, there, own, gigabytes, on_gpu = machine
+    words = ("threads=null", *words) if not any(word.startswith("threads") for word in words) else words
+    assert fitted([tiny(*words)], planned, there, own, gigabytes * 2**30, on_gpu) == (at_once, cores)
+
+
+def test_a_training_has_as_many_cores_when_it_goes_on_after_others_have_ended(
+    tiny: Compose, recorded: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
+    jobs = [Job(tiny(f"seed={seed}")) for seed in range(4)]
+    assert fitting(jobs, 4) == fitting(jobs[:1], 4) == Launcher("joblib", {"n_jobs": 4, "cores": 2})
+    assert fitting(jobs[:1], 1) == BASIC
+    told: list[str] = []
+
+    class Ends(FakeProcess):
+        def __init__(self, _: list[str], env: dict[str, str], **__: object) -> None:
+            told.append(env["OMP_NUM_THREADS"])
+
+    monkeypatch.setattr(subprocess, "Popen", Ends)
+    for seed in range(3):
+        recorded(f"seed={seed}")
+    train_side_by_side(jobs, fitting(jobs, 4))
+    assert told == ["2"]
 
 
 class FakeProcess:

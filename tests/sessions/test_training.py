@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 import torch
 
+from atlantis_exp.build import build_learner
 from atlantis_exp.checking import parse, to_dict
 from atlantis_exp.commands.overrides import read_override
 from atlantis_exp.commands.train import VERB
@@ -124,6 +125,8 @@ def test_more_of_a_run_whose_plan_is_over_is_answered_with_what_begins_with_its_
     assert (
         f"atlantis_exp export run={folder.name} to=pretrained/{folder.name} paths.outputs={tiny().paths.outputs}" in out
     )
+    train(Job(tiny("budget.flops=1e3"), overrides=("phase.quick.steps=160", "budget.flops=1e3")))
+    assert "budget.flops=1000.0 adds nothing to a plan that is over" in capsys.readouterr().out
     assert out.endswith(f"atlantis_exp phase.quick.steps=160 training.weights=pretrained/{folder.name}\n")
 
 
@@ -197,6 +200,24 @@ def test_a_run_says_what_it_was_made_on(tiny: Compose) -> None:
     assert name
     assert ":" not in name
     assert instructions == torch.backends.cpu.get_cpu_capability()
+
+
+@pytest.mark.parametrize("more", ["budget.flops=1e9", "budget.flops=null"])
+def test_a_budget_of_arithmetic_ends_a_run_at_the_step_that_spends_it_and_a_larger_one_goes_on(
+    tiny: Compose, more: str
+) -> None:
+    quiet = ("evaluation.at_end=false", "evaluation.every_steps=null")
+    each = build_learner(tiny(*quiet)).update_flops((4, 40, 40), 4)
+    for flops in (5 * each, 5 * each + 1):  # ends at five updates, then at six
+        train(Job(config := tiny(*quiet, f"budget.flops={flops}")))
+        result = RunFolder.of(config).result
+        assert result is not None
+        assert (result.outcome, result.counts["flops"]) == ("budget", each * -(-flops // each))
+        assert RunFolder.of(config).ended(config.budget.limits) == result
+    train(Job(config := tiny(*quiet, more)))
+    result = RunFolder.of(config).result
+    assert result is not None
+    assert result.outcome == "finished"
 
 
 @pytest.mark.slow

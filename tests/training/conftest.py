@@ -136,6 +136,7 @@ def small() -> Callable[..., Trainer]:
         episode_steps: int = 40,
         capacity: int = CAPACITY,
         max_steps: int | None = None,
+        max_updates: int | None = None,
         console: Console | None = None,
         **options: Any,
     ) -> Trainer:
@@ -179,6 +180,7 @@ def small() -> Callable[..., Trainer]:
             ),
             checkpoints=Checkpoints(folder / "checkpoints", "small"),
             max_steps=max_steps,
+            max_flops=None if max_updates is None else max_updates * learner.update_flops((STACK, SIZE, SIZE), 4),
         )
         if (state := trainer.checkpoints.load(trainer.memory)) is not None:
             trainer.load_state_dict(state)

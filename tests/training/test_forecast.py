@@ -107,6 +107,8 @@ def test_what_is_left_is_expected_of_a_training(small: Callable[..., Trainer], t
     assert whole.hours == pytest.approx(160 * seconds_a_step / 3600)
     assert expected_of(trainer, 8, done=Counters(steps=100)).steps == 60
     assert expected_of(small(tmp_path, max_steps=50), 8, done=Counters(steps=20)).steps == 30
+    assert expected_of(small(tmp_path, max_updates=5), 8, done=Counters(steps=30)).steps == 20 + 5 * 4 - 30
+    assert expected_of(small(tmp_path, max_updates=5, max_steps=35), 8).steps == 35
     assert expected_of(trainer, 8, done=Counters(steps=500)).steps == 1
     trainer.plan = replace(trainer.plan, unit="episodes")
     assert expected_of(trainer, 8).steps == 160 * trainer.emulators.game.episode_steps

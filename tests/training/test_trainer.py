@@ -375,6 +375,34 @@ def test_a_run_that_ends_where_it_was_evaluated_in_passing_is_evaluated_in_full(
     assert curve(tmp_path, "evaluation/episodes") == [(80, 1), (80, 2)]
 
 
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_a_training_ends_at_the_first_step_at_which_its_updates_are_made_and_is_resumed_bit_for_bit(
+    small: Small, tmp_path: Path, num_envs: int
+) -> None:
+    asked = {"num_envs": num_envs, "max_updates": 11}
+    unbroken = small(tmp_path / "unbroken", **asked)
+    before: dict[int, int] = {}  # updates made when a step begins
+    assert unbroken.run(lambda: before.setdefault(unbroken.counters.steps, unbroken.learner.updates) < 0) == "budget"
+    assert before.pop(unbroken.counters.steps, 11) == 11 == unbroken.learner.updates
+    assert max(before.values()) == 10
+    assert unbroken.recorder.evaluated_at == unbroken.counters.steps
+    assert unbroken.last_step is not None
+    assert abs(unbroken.last_step - unbroken.counters.steps) <= 2 * max(num_envs, 4)
+
+    assert small(tmp_path / "broken", **asked).run(after(15)) == "interrupted"
+    assert small(tmp_path / "broken", **{**asked, "max_updates": 5}).run() == "budget"
+    larger = small(tmp_path / "broken", **asked)
+    assert larger.run() == "budget"
+    assert larger.counters.steps == unbroken.counters.steps
+    weights = [print_of(trainer, tmp_path / "broken")["weights"] for trainer in (larger, unbroken)]
+    assert weights[0] == weights[1]
+
+    for stop in (after(15), lambda: False):
+        continued = small(tmp_path / "again", **asked)
+        continued.run(stop)
+    assert print_of(continued, tmp_path / "again") == print_of(unbroken, tmp_path / "unbroken")
+
+
 @pytest.mark.parametrize("step", [80, 120])  # one amid the training, the one at its end
 def test_an_evaluation_that_is_asked_to_stop_is_made_good(small: Small, tmp_path: Path, step: int) -> None:
     unbroken = small(tmp_path / "unbroken", phases=phases(120))

@@ -10,14 +10,22 @@ from contextlib import suppress
 from types import FrameType
 from typing import NoReturn
 
+import psutil
+
 from atlantis_exp import terminal
+from atlantis_exp.build import choose_device
+from atlantis_exp.config import Config
 from atlantis_exp.faults import Fault
-from atlantis_exp.machine import JOB_OF, all_cores
+from atlantis_exp.machine import JOB_OF, all_cores, here
 from atlantis_exp.runs.files import make_folder, no_link
 from atlantis_exp.runs.folder import OUTPUT, RunFolder
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
-from atlantis_exp.sessions.launchers import Launcher
+from atlantis_exp.sessions.launchers import BASIC, Launcher
+
+_ON_A_GPU = 4  # trainings that share one at no cost: docs/performance.md
+_PROCESS_BYTES = 2**30  # of memory that a training takes besides its replay memory
+_COMPRESSED = 8  # times that observations shrink at least, the whole screen among them
 
 
 class _Running:
@@ -38,6 +46,42 @@ class _Running:
         sys.exit(128 + number)
 
 
+def fitting(jobs: Sequence[Job], planned: int) -> Launcher:
+    """Return the launcher that trains as many jobs at a time as this machine runs well; if that is one, the basic one.
+
+    planned: the jobs of the whole sweep or look, some of which may have ended.
+    """
+    configs = [job.config for job in jobs]
+    on_gpu = any(choose_device(config.device).type != "cpu" for config in configs)
+    memory = psutil.virtual_memory().available
+    at_once, cores = fitted(configs, planned, all_cores(), here().cores, memory, on_gpu)
+    return BASIC if at_once == 1 else Launcher("joblib", {"n_jobs": at_once, "cores": cores})
+
+
+def fitted(configs: Sequence[Config], planned: int, cores: int, own: int, memory: int, on_gpu: bool) -> tuple[int, int]:
+    """Return how many trainings a machine runs well at a time, and the cores of each.
+
+    With one core each most seeds an hour are trained, unless a person says more by `threads`, `env.workers` or
+    OMP_NUM_THREADS. The cores are divided by the planned number of trainings, not by those that are left: one that
+    goes on has as many as before, on which its last bits depend.
+
+    own: cores, as OMP_NUM_THREADS says; as many as the machine has where it says nothing.
+    memory: available bytes.
+    """
+    asked = [config.threads or 1 for config in configs] + [config.env.workers or 1 for config in configs]
+    each = max([own if own < cores else 1, *asked])
+    most = [planned, cores // each, memory // max(map(_memory, configs)), *([_ON_A_GPU] if on_gpu else [])]
+    at_once = max(1, min(most))
+    return at_once, own if own < cores else cores // at_once
+
+
+def _memory(config: Config) -> int:
+    """Return the bytes that a training takes at most, but for a network that is larger than ours."""
+    lengths = [phase.steps or config.replay.capacity for phase in config.phase.values()]
+    observations = min(config.replay.capacity, sum(lengths), config.budget.steps or config.replay.capacity)
+    return _PROCESS_BYTES + min(config.replay.max_bytes, observations * config.env.size**2 // _COMPRESSED)
+
+
 def train_side_by_side(jobs: Sequence[Job], launcher: Launcher) -> None:
     """Train jobs, as many at a time as the launcher says and the cores divided among them.
 
@@ -45,8 +89,10 @@ def train_side_by_side(jobs: Sequence[Job], launcher: Launcher) -> None:
         Fault: the first job's that failed, once all have ended.
     """
     at_once, share = shared(all_cores(), launcher.settings["n_jobs"], jobs)
-    # A person's own number of threads goes before.
-    running = _Running({"OMP_NUM_THREADS": f"{share}", "MKL_NUM_THREADS": f"{share}", **os.environ, JOB_OF: "joblib"})
+    # A person's own number of threads goes before, but for one that would have each job take the whole machine.
+    share = min(launcher.settings.get("cores", share), here().cores)
+    threads = {"OMP_NUM_THREADS": f"{share}", "MKL_NUM_THREADS": f"{share}"}
+    running = _Running({**os.environ, **threads, JOB_OF: "joblib"})
     handlers = {number: signal.signal(number, running.end) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with ThreadPoolExecutor(at_once, "job") as pool:  # ends when its jobs have
@@ -64,7 +110,7 @@ def shared(cores: int, n_jobs: int, jobs: Sequence[Job]) -> tuple[int, int]:
 
     n_jobs: at a time; below zero, that many fewer than one a core and one more, as joblib counts them.
     """
-    left = sum(RunFolder.of(job.config).ended(job.config.budget.steps) is None for job in jobs)
+    left = sum(RunFolder.of(job.config).ended(job.config.budget.limits) is None for job in jobs)
     at_once = max(min(n_jobs if n_jobs > 0 else cores + 1 + n_jobs, left), 1)
     return at_once, max(cores // at_once, 1)
 
@@ -72,7 +118,7 @@ def shared(cores: int, n_jobs: int, jobs: Sequence[Job]) -> tuple[int, int]:
 def _train_apart(job: Job, running: _Running) -> None:
     """Train in a process of its own. Raises: Fault where the run fails."""
     config, folder = job.config, RunFolder.of(job.config)
-    if folder.ended(config.budget.steps) is not None:
+    if folder.ended(config.budget.limits) is not None:
         return
     make_folder(folder.path)
     with open(folder.path / OUTPUT, "a+", opener=no_link) as output:
@@ -100,6 +146,6 @@ def _train_apart(job: Job, running: _Running) -> None:
     if code < 0 or code == 1:
         with suppress(Fault), folder.held():
             has_said_so = code == 1 and folder.state == "failed"
-            if not has_said_so and folder.ended(config.budget.steps) is None:  # else it died after its run's end
+            if not has_said_so and folder.ended(config.budget.limits) is None:  # else it died after its run's end
                 Journal(folder.path).status("KILLED" if code < 0 else "FAILED", reason)
     raise Fault(f"run {folder.name}: {reason}; see {folder.path / OUTPUT}", exit_code=code if code > 0 else 128 - code)

@@ -1,0 +1,64 @@
+"""What a machine gains by training seeds at the same time: `python -m benchmarks.side_by_side`.
+
+A training on all cores and several at a time, as many and with as many cores each as `decide` and sweeps choose here,
+take turns. Evaluations are left out. Seeds an hour are as steps a second, those of trainings at a time added up.
+"""
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
+
+from atlantis_exp.machine import here
+from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.launchers.joblib import fitting
+from benchmarks.composition import composed
+from benchmarks.contest import Contestant, Measure, paired_ratio, print_rates, print_results, take_turns
+from benchmarks.training import learning, steps_per_second
+
+_WORK = (  # experiment=fast amid its training
+    *("experiment=fast", "training.learn_start=1_000", "epsilon=constant", "epsilon.value=0.05"),
+    *("evaluation.every_steps=null", "evaluation.at_end=false"),
+)
+
+
+@contextmanager
+def training(cores: int, overrides: Sequence[str]) -> Iterator[Measure[float]]:
+    """A training on some cores."""
+    with learning(composed(*_WORK, f"threads={cores}", f"env.workers={cores}", *overrides)) as trainer:
+        yield partial(steps_per_second, trainer)
+
+
+def together(contestants: Sequence[Contestant[float]], seconds: float) -> float:
+    """Let contestants work at the same time; return their steps a second, added up."""
+    for contestant in contestants:
+        contestant.begin(seconds)
+    return sum([contestant.finish() for contestant in contestants])
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table and the JSON line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.side_by_side", description="seeds an hour")
+    parser.add_argument("--seeds", type=int, default=10, help="trainings there are to do")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of a turn")
+    parser.add_argument("overrides", nargs="*", help="of the training, as model=resnet")
+    args = parser.parse_args(arguments)
+    settings = fitting([Job(composed(*_WORK, *args.overrides))], args.seeds).settings
+    at_once, cores = settings.get("n_jobs", 1), settings.get("cores", here().cores)
+    with ExitStack() as stack:
+
+        def turn(count: int, each: int) -> Callable[[], float]:
+            program = partial(training, each, args.overrides)
+            contestants = [stack.enter_context(Contestant(program)) for _ in range(count)]
+            return partial(together, contestants, args.seconds)
+
+        names = "one after the other", f"{at_once} at a time"
+        rates = take_turns(dict(zip(names, (turn(1, here().cores), turn(at_once, cores)), strict=True)), args.rounds)
+    print_rates(f"all trainings, {at_once} at a time on {cores} cores each", "steps/s", rates)
+    gain = paired_ratio(rates[names[1]], rates[names[0]])
+    print_results({"at_once": at_once, "cores_each": cores, "seeds_an_hour": gain})
+
+
+if __name__ == "__main__":
+    main()
