@@ -22,7 +22,8 @@ def main(target: Path) -> None:
     (target / "lab").mkdir(parents=True)
     for folder in ("images", "data"):
         shutil.copytree(ROOT / "docs" / folder, target / folder)
-    shutil.copy(ROOT / "docs" / "iframe-worker.js", target)
+    for name in ("iframe-worker.js", "json.schema.json"):
+        shutil.copy(ROOT / "docs" / name, target)
     pages = {path.name: path for path in (ROOT / "docs").glob("*.md")}
     pages |= {f"lab/{path.name}": path for path in (ROOT / "lab").glob("*.md")}
     pages |= {name: ROOT / f"{source}.md" for source, name in WHOLE.items()}

@@ -136,16 +136,14 @@ def lost_links(path: Path) -> set[str]:
     for link in links_of(path):
         name, _, anchor = link.partition("#")
         target = path.parent / name if name else path
-        is_checked = anchor and path.name not in LONG
-        if not target.exists() or (is_checked and anchor not in anchors_of(target.read_text())):
+        if not target.exists() or (anchor and anchor not in anchors_of(target.read_text())):
             lost.add(link)
     return lost
 
 
-LONG = {"comparison.md", "verdict-procedure.md"}  # not cut yet
 PAGES = [REPOSITORY / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")]
 PAGES += [*DOCS.glob("*.md"), *(REPOSITORY / "lab").glob("*.md"), REPOSITORY / "results" / "README.md"]
-SHORT = [path for path in PAGES if path.name not in LONG and path.parent.name != "lab"]
+SHORT = [path for path in PAGES if path.parent.name != "lab"]
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)

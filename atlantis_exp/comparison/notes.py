@@ -418,7 +418,7 @@ def random_player(facts: Facts) -> Iterator[str]:
 
 
 CAVEATS: Sequence[Note] = (
-    *(stands, by_training, further_answers, conditions, collapsed, lost_seeds, gaps, equal, modes_found, unlike, lossy),
+    *(by_training, stands, further_answers, conditions, collapsed, lost_seeds, gaps, equal, modes_found, unlike, lossy),
     uncommitted,
     *(unbalanced, later_seeds, moved_seeds),
 )
