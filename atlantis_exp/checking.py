@@ -63,7 +63,7 @@ def absolute(key: str, text: str) -> Path:
         path = Path(text).expanduser().absolute()
         str(path).encode()
     except RuntimeError:
-        raise ConfigError(f"{key}={text}: the user that ~ names does not exist here") from None
+        raise ConfigError(f"{key}={text}: there is no such user") from None
     except UnicodeEncodeError:
         raise ConfigError(f"{key}={text}: is in a folder whose name is not UTF-8; name another folder") from None
     return path

@@ -187,6 +187,8 @@ def test_the_verdict_of_the_readme_is_the_one_that_is_printed(
     shutil.copytree(RESULTS / "verdict", tmp_path, dirs_exist_ok=True)
     asked = ("by=model", "runs=decide-7cfff86226", "seeds=10", "at_epsilon=0.05", "tracking=none")
     assert command("compare", *asked, f"paths.outputs={tmp_path}") == 0
-    (shown,) = re.findall(r"^    - (By model: .*)\n    \.\.\.\n\n    (.*)$", (REPOSITORY / "README.md").read_text(), re.MULTILINE)
+    (shown,) = re.findall(
+        r"^    - (By model: .*)\n    \.\.\.\n\n    (.*)$", (REPOSITORY / "README.md").read_text(), re.MULTILINE
+    )
     printed = " ".join(capsys.readouterr().out.split())
     assert all(line in printed for line in shown)

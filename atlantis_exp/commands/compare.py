@@ -17,6 +17,7 @@ from atlantis_exp.documents import Format
 from atlantis_exp.faults import ConfigError
 
 if TYPE_CHECKING:
+    from atlantis_exp.comparison.tables import Comparison
     from atlantis_exp.comparison.verdict import Question
 
 
@@ -109,11 +110,12 @@ def _work(asked: Asked[CompareConfig]) -> Callable[[], object]:
         *(Path(config.paths.outputs), config.runs, config.where, config.at_epsilon), scores, named(config.columns)
     )
 
-    def call() -> None:
+    def call() -> "Comparison":
         now = config.look == "now"
         comparison = compare(config.question, choice, config.tracking, asked.command, look_now=now)
         terminal.document(comparison.document("compare").model_dump_json())
         refuse_worse_commits(comparison, config.baseline)
+        return comparison
 
     return call
 

@@ -343,7 +343,8 @@ def mixed(facts: Facts) -> Iterator[str]:
 
 def equal_shares(facts: Facts) -> Iterator[str]:
     """Say whether all runs were trained for equal steps, episodes or arithmetic, and what a run took of the others."""
-    runs = facts.trainings
+    if not (runs := facts.trainings):
+        return
     (ended, *others) = dict.fromkeys(map(_ended_by, runs))
     phases = {tuple((key, run.science[key]) for key in sorted(run.science) if _LENGTH.fullmatch(key)) for run in runs}
     if others or len(facts.groups) < 2 or (ended == "the whole plan" and len(phases) > 1):

@@ -230,7 +230,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("report paths.output=x", "paths.output", "'paths.outputs'"),
     ("new component.model=cnn to=x", "model=cnn", "built in"),
     ("new component.model=MyNet to=x", "model=MyNet", "lowercase letters"),
-    ("new component.model=class to=x", "model=class", "Python's own"),
+    ("new component.model=class to=x", "model=class", "a keyword of Python"),
     ("ui port=80", "port=80", "greater than or equal to 1024"),
 ]
 
@@ -249,7 +249,7 @@ def test_a_mistake_is_one_line_that_names_the_key_and_what_would_be_right(line: 
 
 
 def test_a_plugin_of_an_unknown_user_is_one_line_before_hydra_reads_it() -> None:
-    with pytest.raises(ConfigError, match=r"^plugins=~nobodyhere/mynet\.py: the user that ~ names does not exist"):
+    with pytest.raises(ConfigError, match=r"^plugins=~nobodyhere/mynet\.py: there is no such user"):
         located(["plugins=~nobodyhere/mynet.py"])
 
 

@@ -730,7 +730,8 @@ def test_a_sweep_runs_what_is_missing_and_tables_what_it_found(
     capsys.readouterr()
     monkeypatch.setattr(sys, "argv", ["atlantis_exp"])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    VERB.run([*replaced(tiny_overrides, *SHORT, f"paths.outputs={config.paths.outputs}", "seed=0,1"), "-m"])
+    words = replaced(tiny_overrides, *SHORT, f"paths.outputs={config.paths.outputs}", "seed=0,1")
+    VERB.run([*words, "hydra/launcher=basic", "-m"])
     done, error = capsys.readouterr()
     assert error == ""
     tables = [line for line in done.splitlines() if line.startswith("sweep of 2 runs")]
@@ -753,7 +754,7 @@ def test_a_signal_that_comes_when_a_run_has_nothing_left_to_stop_ends_its_sweep(
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     words = replaced(tiny_overrides, *SHORT, f"paths.outputs={tmp_path}", "seed=0,1")
     with pytest.raises(SystemExit, match="143"):
-        VERB.run([*words, "-m"])
+        VERB.run([*words, "hydra/launcher=basic", "-m"])
     assert trained == [0]
     VERB.run(replaced(words, "seed=2"))  # done, so what one is to do
     assert trained == [0, 2]
