@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from atlantis_exp.comparison.decision import mean_interval
+from atlantis_exp.comparison.decision import Plan, decide, mean_interval
+from atlantis_exp.comparison.estimands import score_of
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.components import game_of
 from atlantis_exp.runs.episodes import EpisodeTable
@@ -33,7 +34,7 @@ SOURCES = (*pace.PAID, "wave_bonus")  # of points
 RANDOM = 20_873  # the mean of a random player
 PEERS = ("DreamerV3", "QR-DQN Impala ResNet", "QR-DQN Nature CNN")
 PUBLISHED = {(row["name"], row["frames"]): row["mean"] for row in curves(game_of("Atlantis-v0"))}
-LAB, REPRODUCTION = "lab/results.md", "lab/reproduction.md"
+LAB, REPRODUCTION, ASKED = "lab/results.md", "lab/reproduction.md", "lab/questions.md"
 
 
 def games_at(run: RunFolder, step: int | None = None) -> EpisodeTable:
@@ -141,6 +142,17 @@ def of_the_verdicts() -> Iterator[tuple[str, str]]:
         yield LAB, f"{int(row['mean']):,} ({int(row['interquartile_mean']):,})"
     here = games_at(of_the_verdict("resnet_fast", "top_half")[4]).scores.mean()
     yield LAB, f"{here - float(next(row['mean'] for row in printed if row['seed'] == '4')):,.0f}"
+
+
+def of_the_training_score() -> Iterator[tuple[str, str]]:
+    scores = {
+        model: {seed: score_of(run) for seed, run in of_the_verdict(model).items()} for model in ("cnn", "resnet_fast")
+    }
+    for seeds, plan in ((5, Plan()), (10, Plan(looks=(10,)))):
+        chosen = {model: {seed: each[seed] for seed in range(seeds)} for model, each in scores.items()}
+        (verdict,) = decide(chosen, plan).verdicts
+        assert verdict.said == "better"
+        yield from ((ASKED, text) for text in whole((verdict.difference, verdict.low, verdict.high)))
 
 
 def of_three_networks() -> Iterator[tuple[str, str]]:
@@ -272,6 +284,7 @@ def of_the_reports_protocol() -> Iterator[tuple[str, str]]:
 SECTIONS = (
     of_every_run,
     of_the_verdicts,
+    of_the_training_score,
     of_three_networks,
     of_the_fields_game,
     of_rewards,
@@ -285,7 +298,7 @@ SECTIONS = (
 def numbers() -> dict[str, list[str]]:
     """Return every published number, by page."""
     said = list(dict.fromkeys(itertools.chain.from_iterable(section() for section in SECTIONS)))
-    return {page: [text for of, text in said if of == page] for page in (LAB, REPRODUCTION)}
+    return {page: [text for of, text in said if of == page] for page in (LAB, REPRODUCTION, ASKED)}
 
 
 @cache
