@@ -8,7 +8,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 
 from atlantis_exp.commands.app import Asked
 from atlantis_exp.commands.jobs import job_of
-from atlantis_exp.commands.overrides import check, is_longer, key_of, read_flags, read_override
+from atlantis_exp.commands.overrides import check, flags_of, is_longer, key_of, read_override
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import Job
@@ -71,7 +71,7 @@ def check_space(space: Space, overrides: Sequence[str]) -> Job:
     Raises:
         ConfigError: one is not valid, or a key has a value already.
     """
-    fixed = {key_of(text) for text in read_flags(overrides)[0]}
+    fixed = {key_of(text) for text in flags_of(overrides).overrides}
     if twice := sorted(fixed & space.keys()):
         raise ConfigError(f"{twice[0]}: has one value and is to be searched; drop one of them")
     ends = {
