@@ -15,7 +15,6 @@ from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.compare import as_texts, listed, margin
 from atlantis_exp.commands.jobs import training_of
 from atlantis_exp.commands.overrides import (
-    check,
     combined,
     flags_of,
     key_of,
@@ -128,7 +127,6 @@ def contest_of(asked: Asked[DecideConfig]) -> "Contest":
     shared = [text for text in texts if text not in (*several, *launchers)]
     fixed = [text for text in shared if text.lstrip("+~").split("=")[0].split(".")[0] not in _OWN]
     flags = [text for text in typed if text.startswith("--config-dir=")]
-    check("config", Config, ["-m", *flags, *several, *fixed])
     delta, relative = margin(config.delta)
     keys = tuple(override.key_or_group for override in overrides)
     return Contest(

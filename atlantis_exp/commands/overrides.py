@@ -65,11 +65,7 @@ def flags_of(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def located(arguments: Sequence[str]) -> list[str]:
-    """Return arguments that mean the same in any folder: flags first, paths absolute, `sweep=FILE` filled in.
-
-    Raises:
-        ConfigError: a flag is unknown or the file cannot be read.
-    """
+    """Return arguments that mean the same in any folder, with `sweep=FILE` filled in. Raises: ConfigError."""
     flags = flags_of(arguments)
     parts = (_from_file(text[6:]) if text.startswith("sweep=") else [text] for text in flags.overrides)
     return [
@@ -163,11 +159,7 @@ def swept(arguments: Sequence[str]) -> list[str]:
 
 
 def launcher(arguments: Sequence[str]) -> Launcher:
-    """Return the launcher that a command line names by `hydra/launcher=NAME` and `hydra.launcher.KEY=VALUE`.
-
-    Raises:
-        ConfigError: the launcher or a setting is unknown, or it is Hydra's other key, which could name code.
-    """
+    """Return the launcher of `hydra/launcher=NAME` and `hydra.launcher.KEY=VALUE`. Raises: ConfigError."""
     flags = flags_of(arguments)
     overrides = [override for text in flags.overrides if _is_hydras(override := read_override(text))]
     name = "basic"
@@ -279,14 +271,13 @@ def values_of(override: Override) -> list[str]:
 def with_first_values(arguments: Sequence[str]) -> list[str]:
     """Return arguments with only the first value of each key. Raises: ConfigError for a key without values."""
     several = swept(arguments)
-    return [_first_value(text) if text.lstrip("+") in several else text for text in arguments]
 
+    def first(text: str) -> object:
+        override = read_override(text)
+        value = override.value()
+        return value.start if isinstance(value, IntervalSweep) else values_of(override)[0]
 
-def _first_value(text: str) -> str:
-    override = read_override(text)
-    value = override.value()
-    first = value.start if isinstance(value, IntervalSweep) else values_of(override)[0]
-    return f"{text.split('=', 1)[0]}={first}"
+    return [f"{text.split('=', 1)[0]}={first(text)}" if text.lstrip("+") in several else text for text in arguments]
 
 
 def is_longer(values: RangeSweep, most: int) -> bool:

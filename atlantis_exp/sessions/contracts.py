@@ -281,11 +281,7 @@ def _resumes(small: Job) -> None:
 
 
 def _train(small: Job, outputs: Path, kill: bool = False) -> bool:
-    """Train under `outputs` in a process of its own, or kill that after its first commit; return whether it was killed.
-
-    Raises:
-        Fault: the training failed.
-    """
+    """Train in a process of its own, with `kill` to the first commit; return whether it was killed. Raises: Fault."""
     own = replaced(small.overrides, f"paths.outputs={outputs}", "tracking.commit_seconds=1.0", "resume=auto")
     command = (sys.executable, "-m", "atlantis_exp", "train", *own)
     with (

@@ -181,11 +181,7 @@ class Contest:
         return compare(self.question, choice, self.config.tracking, self.comparing)
 
     def needed(self, comparison: Comparison | None) -> dict[str, list[int]]:
-        """Return the seeds that each contender lacks for its next look; empty once there is none.
-
-        Raises:
-            Fault: more seeds would not help.
-        """
+        """Return the seeds that contenders lack for the next look. Raises: Fault if more would not help."""
         if comparison is None:
             lacking = {label: self.left(label, range(self.looks[0])) for label in self.contenders}
             return {label: seeds for label, seeds in lacking.items() if seeds}
