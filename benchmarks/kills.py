@@ -12,20 +12,30 @@ of two seeds on joblib, which is started as a person would, and killed with all 
 
 import argparse
 import itertools
+import math
 import multiprocessing
 import os
+import random
 import shutil
+import signal
+import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 from rich.console import Console
 
 from atlantis_exp import commands, terminal
+from atlantis_exp.config import Config
+from atlantis_exp.faults import Fault
+from atlantis_exp.sessions.contracts import fingerprints
 from atlantis_exp.sessions.job import replaced
-from atlantis_exp.sessions.verifying import Session, fingerprints, generations, run_and_kill, start
+from atlantis_exp.sessions.page import terminable
 from benchmarks.composition import composed
 from benchmarks.contest import print_results, print_table
 
@@ -45,6 +55,7 @@ TRAININGS = {
 SWEEP = "sweep"
 _KILLS_OF_ONE = {SWEEP: 5}  # copies of the others are killed until they end
 _SECONDS = 0.3  # after a commit; there is one every 0.1 s
+_EARLY_SECONDS = 10.0  # in which a session starts
 _FORKS = multiprocessing.get_context("forkserver")
 
 
@@ -104,6 +115,89 @@ def _killed(name: str, outputs: Path, kills: int, early: float) -> tuple[int, di
         struck = run_and_kill(lambda said: _Fork(words, said), outputs, "*", kills, _SECONDS, early)
     prints = {label: fingerprints(config, outputs) for label, config in configs.items()}
     return struck, {f"{label}{part}": value for label, parts in prints.items() for part, value in parts.items()}
+
+
+def train_and_kill(config: Config, overrides: Sequence[str], outputs: Path, kills: int) -> int:
+    """Train under `outputs` and kill it at a random moment after a commit, `kills` times; return how many struck.
+
+    Raises:
+        Fault: a session ended with an error.
+    """
+    # The moments of commits change nothing, and a run continues from one.
+    own = (f"paths.outputs={outputs}", "tracking.commit_seconds=1.0", "resume=auto")
+    command = (sys.executable, "-m", "atlantis_exp", "train", *replaced(overrides, *own))
+    return run_and_kill(lambda said: start(command, said), outputs, config.run_name(), kills)
+
+
+class Session(Protocol):
+    """A process that trains; `poll` and `wait` as of Popen."""
+
+    pid: int
+
+    def poll(self) -> int | None: ...
+
+    def wait(self) -> int: ...
+
+
+def start(command: Sequence[str], said: Path) -> Session:
+    """Start a command in a process group of its own; stderr goes to the file `said`, stdout to one next to it."""
+    with open(said, "wb") as errors, open(said.with_name("stdout.txt"), "wb") as lines:
+        return subprocess.Popen(command, stdout=lines, stderr=errors, start_new_session=True)
+
+
+@terminable()
+def run_and_kill(
+    start: Callable[[Path], Session], outputs: Path, runs: str, kills: int, seconds: float = 1.0, early: float = 0.0
+) -> int:
+    """Start sessions that write runs under `outputs` until one ends by itself; return how many kills struck.
+
+    Up to `kills` times, a session's process group gets a SIGKILL at a random moment within some seconds of a commit.
+
+    Args:
+        start: starts a session, the leader of a process group, whose stderr goes to the given file.
+        runs: the pattern of the runs' names.
+        early: the share of kills in a session's first `_EARLY_SECONDS` instead.
+
+    Raises:
+        Fault: a session ended with an error.
+    """
+    struck = 0
+    outputs.mkdir(parents=True, exist_ok=True)
+    while True:
+        before = generations(outputs, runs)
+        session = start(outputs / "stderr.txt")
+        moment = time.monotonic() + random.random() * _EARLY_SECONDS if random.random() < early else math.inf
+        try:
+            while struck < kills and session.poll() is None:
+                time.sleep(0.01)
+                if time.monotonic() > moment:
+                    break
+                if generations(outputs, runs) > before:
+                    time.sleep(random.random() * seconds)
+                    break
+            else:
+                if session.wait():
+                    error = _last_line(outputs / "stderr.txt")
+                    raise Fault(f"a session under {outputs} failed: {error or 'it said nothing'}")
+                return struck
+        finally:  # a signal that ends this process does not reach the session, in a group of its own
+            with suppress(ProcessLookupError):  # it has just ended
+                os.killpg(session.pid, signal.SIGKILL)
+        struck += session.wait() == -signal.SIGKILL
+
+
+def _last_line(path: Path) -> str:
+    """Return the last line of a file, empty if there is none."""
+    lines = path.read_text(errors="replace").split("\n") if path.exists() else []
+    return next((line.strip() for line in reversed(lines) if line.strip()), "")
+
+
+def generations(outputs: Path, runs: str) -> int:
+    """Return the number of commits of some runs so far."""
+    newest: dict[Path, int] = {}
+    for path in sorted(outputs.glob(f"runs/{runs}/checkpoints/0*/manifest.json")):
+        newest[path.parents[2]] = int(path.parent.name)
+    return sum(newest.values())
 
 
 class _Fork(Session):

@@ -22,8 +22,9 @@ from atlantis_exp.commands.overrides import check, located
 from atlantis_exp.components import KINDS, admit, admitted, built_in, read
 from atlantis_exp.config import Config
 from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.sessions.contracts import fingerprints
 from atlantis_exp.sessions.job import replaced
-from atlantis_exp.sessions.verifying import fingerprints, train_and_kill
+from benchmarks.kills import train_and_kill
 
 Command = Callable[..., int]
 Said = Callable[..., str]

@@ -24,7 +24,6 @@ VERBS = {
     "query": "describe the environment, and its use by this config",
     "check": "try a component's contracts and measure its cost: model=mynet plugins=./mynet.py",
     "new": "write a package with a component of your own to begin with: model=mynet to=FOLDER",
-    "verify-resume": "prove for any training that killing and continuing it changes no bit",
     "sync": "publish run folders to an MLflow store; to=URI to a server, every=30s until interrupted",
 }
 """The verbs and their purposes, as `--help` lists them: daily ones first."""
@@ -46,7 +45,7 @@ def main() -> None:
     interrupts.listen()
     try:
         verb, arguments = _split(sys.argv[1:])
-        importlib.import_module(f"atlantis_exp.commands.{verb.replace('-', '_')}").VERB.run(arguments)
+        importlib.import_module(f"atlantis_exp.commands.{verb}").VERB.run(arguments)
     except (Exception, KeyboardInterrupt) as error:
         if isinstance(error, Exception) and not interrupts.seen():
             raise

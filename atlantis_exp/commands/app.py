@@ -12,7 +12,7 @@ from atlantis_exp.commands.overrides import check, flags_of, launcher, located, 
 from atlantis_exp.faults import ConfigError, Fault, in_words
 from atlantis_exp.machine import Machine, here
 from atlantis_exp.sessions.job import command_line
-from atlantis_exp.sessions.launchers import Launcher
+from atlantis_exp.sessions.launchers import Launcher, in_turn
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
@@ -74,7 +74,7 @@ class Verb(Generic[T]):
                 elif not launcher(arguments).is_basic:
                     raise ConfigError(f"hydra/launcher: launches trainings, not {self.name}; leave it out")
                 else:
-                    in_turn(self.work, asked)
+                    in_turn(lambda each: self.work(each)(), asked)
         except Fault as error:
             terminal.warn(str(error))
             sys.exit(error.exit_code)
@@ -86,25 +86,5 @@ class Verb(Generic[T]):
         """Check every job that arguments ask for. Raises: ConfigError."""
         admit_plugins([])  # drop the plugins of an earlier command of this process
         refuse_twice(arguments)
-        own = flags_of(arguments).config_dir
-        flags = (f"--config-dir={own}",) if own else ()
         jobs = check(self.config_name or self.name, self.schema, arguments)
-        return [Asked(config, self.name, (*flags, *texts), tuple(typed)) for texts, config in jobs.items()]
-
-
-def in_turn(work: Callable[[Asked[T]], Callable[[], object]], asked: Sequence[Asked[T]]) -> None:
-    """Do the jobs of a sweep one after the other, also after an error; raise the first error at the end.
-
-    A signal that came too late to stop a job ends the process after it.
-    """
-    first: Exception | None = None
-    for each in asked:
-        try:
-            late = work(each)()
-        except Exception as error:
-            first = first or error
-        else:
-            if isinstance(late, int):
-                sys.exit(128 + late)
-    if first is not None:
-        raise first
+        return [Asked(config, self.name, texts, tuple(typed)) for texts, config in jobs.items()]

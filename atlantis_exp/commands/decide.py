@@ -15,16 +15,17 @@ from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.compare import as_texts, listed, margin
 from atlantis_exp.commands.jobs import training_of
 from atlantis_exp.commands.overrides import (
-    check,
     combined,
+    flags_of,
     key_of,
-    read_flags,
+    launcher,
     read_override,
     refuse_twice,
     swept,
     values_of,
     with_first_values,
 )
+from atlantis_exp.commands.train import train_on_a_node
 from atlantis_exp.config import FREE, STRICT, Config
 from atlantis_exp.documents import Format
 from atlantis_exp.faults import ConfigError
@@ -71,17 +72,17 @@ def _launchers(texts: Iterable[str]) -> list[str]:
 
 def _first_contender(arguments: list[str]) -> list[str]:
     """Take the first contender without the launcher: its config, which the others share, is composed and run here."""
-    texts, is_sweep = read_flags(arguments := _as_texts(arguments))
-    if is_sweep:
+    flags = flags_of(arguments := _as_texts(arguments))
+    if flags.multirun:
         raise ConfigError("-m: decide plans its own sweeps; drop -m")
     refuse_twice(arguments)
-    for text in texts:
+    for text in flags.overrides:
         override = read_override(text)
         if override.key_or_group == "seed":
             raise ConfigError(f"{text}: decide trains seeds from 0 on, as many as it needs; drop it")
         if override.key_or_group == "resume" and override.value() != "auto":
             raise ConfigError(f"{text}: decide goes on with the runs that are there; drop it")
-    dropped = _launchers(texts)
+    dropped = _launchers(flags.overrides)
     return with_first_values([argument for argument in arguments if argument not in dropped])
 
 
@@ -121,13 +122,11 @@ def contest_of(asked: Asked[DecideConfig]) -> "Contest":
         contenders = list(combined(choices))
     if len(contenders) < 2:
         raise ConfigError("nothing to decide between: give a key several values, as in model=cnn,resnet_fast")
-    texts = read_flags(typed)[0]  # as typed: Hydra has put values in the place of ${...}
+    texts = flags_of(typed).overrides  # as typed: Hydra has put values in the place of ${...}
     launchers = _launchers(texts)
     shared = [text for text in texts if text not in (*several, *launchers)]
     fixed = [text for text in shared if text.lstrip("+~").split("=")[0].split(".")[0] not in _OWN]
     flags = [text for text in typed if text.startswith("--config-dir=")]
-    launcher = [*flags, *launchers]
-    check("config", Config, ["-m", *launcher, *several, *fixed])
     delta, relative = margin(config.delta)
     keys = tuple(override.key_or_group for override in overrides)
     return Contest(
@@ -138,7 +137,8 @@ def contest_of(asked: Asked[DecideConfig]) -> "Contest":
         contenders,
         several=several,
         fixed=fixed,
-        launcher=launcher,
+        launcher=launcher(["-m", *launchers]) if launchers else None,
+        on_a_node=train_on_a_node,
         job_of=cache(lambda overrides: training_of([*flags, *overrides])),
         command=command_line("decide", *asked.typed),
     )

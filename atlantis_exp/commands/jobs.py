@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from atlantis_exp.checking import digest
 from atlantis_exp.commands.app import Asked
-from atlantis_exp.commands.overrides import check, flags_of, read_flags, read_override
+from atlantis_exp.commands.overrides import check, flags_of, read_override
 from atlantis_exp.config import FREE, Config
 from atlantis_exp.sessions.job import Job
 
@@ -27,7 +27,7 @@ def words_of(overrides: Sequence[str]) -> tuple[str, ...]:
     """
     options: dict[str, str] = {}
     values: dict[str, str] = {}
-    for text in read_flags(overrides)[0]:
+    for text in flags_of(overrides).overrides:
         override = read_override(text)
         key, value = override.get_key_element().lstrip("+"), override.value()
         word = "" if override.is_delete() else value if isinstance(value, str) else json.dumps(value)
@@ -50,5 +50,4 @@ def words_of(overrides: Sequence[str]) -> tuple[str, ...]:
 def training_of(overrides: Sequence[str]) -> Job:
     """Return the training of some overrides. Raises: ConfigError."""
     ((texts, config),) = check("config", Config, overrides).items()
-    own = flags_of(overrides).config_dir
-    return job_of(Asked(config, "train", (f"--config-dir={own}", *texts) if own else texts))
+    return job_of(Asked(config, "train", texts))

@@ -64,18 +64,8 @@ def flags_of(arguments: Sequence[str]) -> argparse.Namespace:
     return flags
 
 
-def read_flags(arguments: Sequence[str]) -> tuple[list[str], bool]:
-    """Return the overrides of a command line, and whether it is a sweep. Raises: ConfigError."""
-    flags = flags_of(arguments)
-    return flags.overrides, flags.multirun
-
-
 def located(arguments: Sequence[str]) -> list[str]:
-    """Return arguments that mean the same in any folder: flags first, paths absolute, `sweep=FILE` filled in.
-
-    Raises:
-        ConfigError: a flag is unknown or the file cannot be read.
-    """
+    """Return arguments that mean the same in any folder, with `sweep=FILE` filled in. Raises: ConfigError."""
     flags = flags_of(arguments)
     parts = (_from_file(text[6:]) if text.startswith("sweep=") else [text] for text in flags.overrides)
     return [
@@ -114,13 +104,13 @@ def _located(match: re.Match[str]) -> str:
 def refuse_twice(arguments: Sequence[str]) -> None:
     """Raise ConfigError for a key with two values: Hydra would take the last."""
     given: dict[str, str] = {}
-    for text in read_flags(arguments)[0]:
+    for text in flags_of(arguments).overrides:
         if (before := given.setdefault(key_of(text), text)) != text:
             raise ConfigError(f"{text}: {before} says something else; write one of the two")
 
 
 def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[tuple[str, ...], T]:
-    """Compose and check every job of a command line; return their configs by their overrides.
+    """Compose and check every job of a command line; return their configs by their overrides and --config-dir.
 
     Raises:
         ConfigError: one line for the first mistake, with the nearest valid choice or the valid range.
@@ -143,7 +133,8 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
         _keys.cache_clear()
     try:
         with composing():
-            return {tuple(job): _check_job(config_name, schema, job, own) for job in _jobs(overrides)}
+            configs = {tuple(job): _check_job(config_name, schema, job, own) for job in _jobs(overrides)}
+        return {((f"--config-dir={own}", *job) if own else job): config for job, config in configs.items()}
     except (HydraException, OmegaConfBaseException) as error:
         reason = f": {error.__cause__}" if isinstance(error.__cause__, OmegaConfBaseException) else ""
         raise ConfigError(" ".join(re.split("Config search path|full_key:", f"{error}{reason}")[0].split())) from None
@@ -164,17 +155,13 @@ def shown(config_name: str, arguments: Sequence[str]) -> str:
 
 def swept(arguments: Sequence[str]) -> list[str]:
     """Return the overrides of a command line that name several values. Raises: ConfigError."""
-    return [text for text in read_flags(arguments)[0] if read_override(text).is_sweep_override()]
+    return [text for text in flags_of(arguments).overrides if read_override(text).is_sweep_override()]
 
 
 def launcher(arguments: Sequence[str]) -> Launcher:
-    """Return the launcher that a command line names by `hydra/launcher=NAME` and `hydra.launcher.KEY=VALUE`.
-
-    Raises:
-        ConfigError: the launcher or a setting is unknown, or it is Hydra's other key, which could name code.
-    """
-    texts, is_sweep = read_flags(arguments)
-    overrides = [override for text in texts if _is_hydras(override := read_override(text))]
+    """Return the launcher of `hydra/launcher=NAME` and `hydra.launcher.KEY=VALUE`. Raises: ConfigError."""
+    flags = flags_of(arguments)
+    overrides = [override for text in flags.overrides if _is_hydras(override := read_override(text))]
     name = "basic"
     for override in overrides:
         text, key = override.input_line, _key(override)
@@ -183,7 +170,7 @@ def launcher(arguments: Sequence[str]) -> Launcher:
             raise ConfigError(f"{text}: write -m for a sweep")
         if override.is_delete() or not (is_choice or key.startswith("hydra.launcher.")):
             raise ConfigError(f"{text}: use only hydra/launcher=NAME and hydra.launcher.KEY=VALUE of Hydra's keys")
-        if not is_sweep:
+        if not flags.multirun:
             raise ConfigError(f"{text}: applies to a sweep; add -m, or leave it out")
         if is_choice:
             name = str(override.value())
@@ -284,14 +271,13 @@ def values_of(override: Override) -> list[str]:
 def with_first_values(arguments: Sequence[str]) -> list[str]:
     """Return arguments with only the first value of each key. Raises: ConfigError for a key without values."""
     several = swept(arguments)
-    return [_first_value(text) if text.lstrip("+") in several else text for text in arguments]
 
+    def first(text: str) -> object:
+        override = read_override(text)
+        value = override.value()
+        return value.start if isinstance(value, IntervalSweep) else values_of(override)[0]
 
-def _first_value(text: str) -> str:
-    override = read_override(text)
-    value = override.value()
-    first = value.start if isinstance(value, IntervalSweep) else values_of(override)[0]
-    return f"{text.split('=', 1)[0]}={first}"
+    return [f"{text.split('=', 1)[0]}={first(text)}" if text.lstrip("+") in several else text for text in arguments]
 
 
 def is_longer(values: RangeSweep, most: int) -> bool:

@@ -8,7 +8,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 
 from atlantis_exp.commands.app import Asked
 from atlantis_exp.commands.jobs import job_of
-from atlantis_exp.commands.overrides import check, is_longer, key_of, read_flags, read_override
+from atlantis_exp.commands.overrides import check, flags_of, is_longer, key_of, read_override
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import Job
@@ -23,13 +23,7 @@ Space = Mapping[str, Distribution]
 
 
 def read_space(texts: Mapping[str, str], closed: set[str]) -> Space:
-    """Return the distributions of texts as `choice(a, b)` or `tag(log, interval(1e-5, 1e-3))`.
-
-    closed: first parts of keys that cannot be searched.
-
-    Raises:
-        ConfigError: the key is closed, or the text is not a set of values.
-    """
+    """Return the distributions of texts; closed: first parts of keys that are not searched. Raises: ConfigError."""
     return {key: _read(key, text, closed) for key, text in texts.items()}
 
 
@@ -66,12 +60,8 @@ def _read(key: str, text: str, closed: set[str]) -> Distribution:
 
 
 def check_space(space: Space, overrides: Sequence[str]) -> Job:
-    """Compose the configs at the corners of a space and return the first.
-
-    Raises:
-        ConfigError: one is not valid, or a key has a value already.
-    """
-    fixed = {key_of(text) for text in read_flags(overrides)[0]}
+    """Compose the configs at the corners of a space and return the first. Raises: ConfigError."""
+    fixed = {key_of(text) for text in flags_of(overrides).overrides}
     if twice := sorted(fixed & space.keys()):
         raise ConfigError(f"{twice[0]}: has one value and is to be searched; drop one of them")
     ends = {

@@ -4,9 +4,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
-from atlantis_exp.commands.app import Asked, Verb, in_turn
+from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.jobs import job_of
-from atlantis_exp.commands.overrides import key_of, read_flags, swept
+from atlantis_exp.commands.overrides import flags_of, key_of, swept
 from atlantis_exp.config import Config
 from atlantis_exp.sessions.job import command_line
 from atlantis_exp.sessions.launchers import Launcher
@@ -20,30 +20,19 @@ def _work(asked: Asked[Config]) -> Callable[[], object]:
 
 def _sweep(asked: Sequence[Asked[Config]], launcher: Launcher, arguments: Sequence[str]) -> None:
     if len(asked) == 1 and launcher.is_basic:
-        in_turn(_work, asked)
+        _work(asked[0])()
         return
     from atlantis_exp.sessions.launchers.joblib import fitting
-    from atlantis_exp.sessions.sweep import ledger, say_hours
+    from atlantis_exp.sessions.sweep import say_hours, sweep
 
     jobs = [job_of(each) for each in asked]
-    if not any(key_of(text) == "hydra/launcher" for text in read_flags(arguments)[0]):
+    if not any(key_of(text) == "hydra/launcher" for text in flags_of(arguments).overrides):
         launcher = fitting(jobs, len(jobs))
         say_hours(jobs, launcher)
-    with ledger(jobs, swept(arguments), launcher, command_line(*arguments)):
-        match launcher.name:
-            case "joblib":
-                from atlantis_exp.sessions.launchers.joblib import train_side_by_side
-
-                train_side_by_side(jobs, launcher)
-            case "slurm":
-                from atlantis_exp.sessions.launchers.slurm import submit
-
-                submit(jobs, launcher, _train_on_a_node)
-            case _:
-                in_turn(_work, asked)
+    sweep(jobs, launcher, swept(arguments), command_line(*arguments), train_on_a_node)
 
 
-def _train_on_a_node(overrides: Sequence[str]) -> None:
+def train_on_a_node(overrides: Sequence[str]) -> None:
     """Train what one job's overrides ask for, in a process that Slurm has started. Raises: Fault."""
     from atlantis_exp.sessions.training import train
 

@@ -48,12 +48,7 @@ class Card:
 
 
 def read_card(folder: Path) -> tuple[Card, bytes]:
-    """Read a folder's card, and its weights as safetensors.
-
-    Raises:
-        ConfigError: the folder or its card is missing or damaged.
-        Fault: the weights are not the card's.
-    """
+    """Read a folder's card and its weights as safetensors. Raises: ConfigError, Fault for other weights."""
     path = folder / "card.json"  # may be a link, as in a cache of downloads: a person named this folder
     if not path.exists():
         choices = {"latest", "best", *(str(card.parent) for card in folder.parent.glob("*/card.json"))}
@@ -114,10 +109,7 @@ def portable(config: Config) -> Config:
 
 
 def build_exported_actor(config: Config, weights: bytes, device: str) -> Actor:
-    """Build the player of exported weights, in float32 on one thread: rounding is then the same everywhere.
-
-    Raises: Fault.
-    """
+    """Build the player of exported weights: float32 on one thread, to round alike everywhere. Raises: Fault."""
     exact = replace(config, threads=1, training=replace(config.training, precision="fp32"))
     set_up_torch(exact, device)
     return build_network_actor(exact, weights, device)

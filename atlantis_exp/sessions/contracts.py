@@ -2,8 +2,11 @@
 
 import copy
 import random
+import signal
+import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -17,7 +20,7 @@ from rich.table import Table
 from torch import nn
 
 from atlantis_exp import documents, terminal
-from atlantis_exp.build import build_component, build_trainer, import_components, make_emulator
+from atlantis_exp.build import build_component, build_memory, build_trainer, import_components, make_emulator
 from atlantis_exp.config import ComponentConfig, Config
 from atlantis_exp.faults import Fault
 from atlantis_exp.learning.learner import Learner
@@ -26,12 +29,13 @@ from atlantis_exp.networks.dropout import seed_dropout
 from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
 from atlantis_exp.networks.sizes import count_parameters
 from atlantis_exp.replay.memory import ReplayMemory
+from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal
-from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.sessions.training import expected
-from atlantis_exp.sessions.verifying import fingerprints, train_and_kill
-from atlantis_exp.training.checkpoint import to_safetensors
+from atlantis_exp.training.checkpoint import Checkpoints, to_safetensors
+from atlantis_exp.training.fingerprint import fingerprint
 from atlantis_exp.training.plan import Counters
 from atlantis_exp.training.progress import Progress
 
@@ -268,12 +272,44 @@ def _pays(config: Config) -> None:
 
 def _resumes(small: Job) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        places = Path(folder) / "unbroken", Path(folder) / "killed"
-        train_and_kill(small.config, small.overrides, places[0], 0)
-        kills = train_and_kill(small.config, small.overrides, places[1], 1)
-        whole, killed = (fingerprints(small.config, place) for place in places)
-    _hold(kills, "the training was too short to be killed")
-    _hold(whole == killed, f"{', '.join(part for part in whole if whole[part] != killed[part])} differ")
+        whole, killed = Path(folder, "unbroken"), Path(folder, "killed")
+        _train(small, whole)
+        _hold(_train(small, killed, kill=True), "the training was too short to be killed")
+        _train(small, killed)
+        one, other = fingerprints(small.config, whole), fingerprints(small.config, killed)
+    _hold(one == other, f"{', '.join(part for part in one if one[part] != other[part])} differ")
+
+
+def _train(small: Job, outputs: Path, kill: bool = False) -> bool:
+    """Train in a process of its own, with `kill` to the first commit; return whether it was killed. Raises: Fault."""
+    own = replaced(small.overrides, f"paths.outputs={outputs}", "tracking.commit_seconds=1.0", "resume=auto")
+    command = (sys.executable, "-m", "atlantis_exp", "train", *own)
+    with (
+        tempfile.TemporaryFile("w+") as said,
+        subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said) as process,
+    ):
+        try:
+            while kill and process.poll() is None and not [*outputs.glob("runs/*/checkpoints/0*/manifest.json")]:
+                time.sleep(0.01)
+            if kill:
+                process.kill()
+            code = process.wait()
+        finally:
+            process.kill()
+        if code not in (0, -signal.SIGKILL):
+            said.seek(0)
+            raise Fault(f"a session failed: {(said.read().splitlines() or ['it said nothing'])[-1]}")
+    return code != 0
+
+
+def fingerprints(config: Config, outputs: Path) -> dict[str, str]:
+    """Return the hashes of a training that has ended under `outputs`. Raises: Fault."""
+    memory = build_memory(config)
+    folder = RunFolder(outputs / "runs" / config.run_name())
+    state = Checkpoints(folder.checkpoints, config.identity()).load(memory)
+    if state is None:
+        raise Fault(f"{folder.path} has no checkpoint")
+    return fingerprint(state, memory, folder.path)
 
 
 def _costs(jobs: Mapping[str, Job]) -> list[documents.Cost]:

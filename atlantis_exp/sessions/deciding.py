@@ -4,7 +4,6 @@ The runs are ordinary ones, and the looks are those of `compare` over them, whos
 moment, the same command goes on where it was.
 """
 
-import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -31,9 +30,9 @@ from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.comparing import Choice, compare
 from atlantis_exp.sessions.job import Job, command_line, labels, quoted, replaced
 from atlantis_exp.sessions.launchers import BASIC, Launcher
-from atlantis_exp.sessions.launchers.joblib import fitting, train_side_by_side
+from atlantis_exp.sessions.launchers.joblib import fitting
 from atlantis_exp.sessions.page import opened, terminable
-from atlantis_exp.sessions.sweep import hours_of, how_many, ledger
+from atlantis_exp.sessions.sweep import hours_of, how_many, sweep
 from atlantis_exp.sessions.training import train
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.training.forecast import duration
@@ -46,7 +45,8 @@ class Contest:
         chosen: the overrides of each contender that tell it from the others.
         several: the overrides with several values, as typed; none: the contenders are no such product.
         fixed: the overrides that all contenders share.
-        launcher: the overrides that choose what runs the trainings; none: as many at a time as the machine runs well.
+        launcher: runs the trainings; None: as many at a time as the machine runs well.
+        on_a_node: trains a job of these overrides in a process of Slurm's.
         job_of: the training that overrides make.
         command: what continues it.
 
@@ -62,12 +62,13 @@ class Contest:
         *,
         several: Sequence[str],
         fixed: Sequence[str],
-        launcher: Sequence[str],
+        launcher: Launcher | None,
+        on_a_node: Callable[[Sequence[str]], None],
         job_of: Callable[[tuple[str, ...]], Job],
         command: str,
     ) -> None:
         self.several, self.launcher, self.command = several, launcher, command
-        self._fixed, self._job_of = fixed, job_of
+        self.on_a_node, self._job_of = on_a_node, job_of
         jobs = {each: job_of((*replaced(fixed, *each),)) for each in chosen}
         facts = {each: flatten(to_dict(job.config)) for each, job in jobs.items()}
         for key in question.by:
@@ -76,15 +77,13 @@ class Contest:
         by = shortened(question.by, facts[chosen[0]])
         self.question = replace(question, by=by)
         groups = {each: Group(values_in(facts[each], by), {}) for each in chosen}
-        self.contenders: dict[str, tuple[tuple[str, ...], Job]] = {}  # own overrides and training, by label
-        trained: dict[str, tuple[str, ...]] = {}  # by the name of the run
+        self.contenders = {groups[each].label: job for each, job in jobs.items()}
+        named: dict[str, tuple[str, ...]] = {}  # by label, and by the name of the run
         for each in chosen:  # two may be written alike
-            job, label = jobs[each], groups[each].label
-            if label in self.contenders:
-                raise ConfigError(f"{' '.join(each)}: the same contender as {_said(self.contenders[label][0])}")
-            if (twin := trained.setdefault(job.config.run_name(), each)) is not each:
+            if (twin := named.setdefault(groups[each].label, each)) is not each:
+                raise ConfigError(f"{' '.join(each)}: the same contender as {_said(twin)}")
+            if (twin := named.setdefault(jobs[each].config.run_name(), each)) is not each:
                 raise ConfigError(f"{' '.join(each)}: trains what {_said(twin)} trains, under the same name")
-            self.contenders[label] = (each, job)
         if mixed := mixed_protocol({groups[each].label: facts[each] for each in chosen}, by):
             raise ConfigError(f"{mixed[1]}; give that key itself several values, or train them under one protocol")
         explored = [
@@ -93,12 +92,17 @@ class Contest:
         if question.score == "training" and any(each != explored[0] for each in explored):
             raise ConfigError("score=training: contenders differ in epsilon, which is a part of it; use score=last")
         self.families = families(list(groups.values()), self.question)  # without seeds
-        self._refuse_longer_runs()
+        for folder in self.runs:
+            if (longer := folder.beyond(self.config.budget.limits)) is not None:
+                raise ConfigError(
+                    f"{longer[0]}: run {folder.name} was trained for {longer[1]}; ask for as many, "
+                    "or for other paths.outputs"
+                )
 
     @property
     def config(self) -> Config:
         """The first contender's; what says how trainings are run and measured is the same for all."""
-        return next(iter(self.contenders.values()))[1].config
+        return next(iter(self.contenders.values())).config
 
     @property
     def outputs(self) -> Path:
@@ -125,8 +129,10 @@ class Contest:
 
     @cached_property
     def here(self) -> Launcher:
-        """What runs the trainings on this machine if no launcher is chosen; not asked again amid the decision."""
-        return fitting([job for _, job in self.contenders.values()], len(self.contenders) * self.looks[0])
+        """What runs the trainings; the machine is not asked again amid the decision."""
+        if self.launcher is not None:
+            return self.launcher
+        return fitting([*self.contenders.values()], len(self.contenders) * self.looks[0])
 
     @cached_property
     def runs(self) -> list[RunFolder]:
@@ -152,7 +158,7 @@ class Contest:
 
     def job(self, label: str, seed: int) -> Job:
         """Return the training of a contender with a seed."""
-        _, job = self.contenders[label]
+        job = self.contenders[label]
         overrides = (*job.overrides, f"seed={seed}")
         if any("${" in text for text in overrides):  # a value may follow from the seed; else composing is slow
             return self._job_of(overrides)
@@ -165,14 +171,6 @@ class Contest:
     def _has_ended(self, folder: RunFolder) -> bool:
         return folder.ended(self.config.budget.limits) is not None
 
-    def _refuse_longer_runs(self) -> None:
-        for folder in self.runs:
-            if (longer := folder.beyond(self.config.budget.limits)) is not None:
-                raise ConfigError(
-                    f"{longer[0]}: run {folder.name} was trained for {longer[1]}; ask for as many, "
-                    "or for other paths.outputs"
-                )
-
     def look(self) -> Comparison | None:
         """Return the comparison of the runs there, with the look that is due; None before the first look's seeds."""
         ended = [folder.name for folder in self.runs if self._has_ended(folder)]
@@ -183,11 +181,7 @@ class Contest:
         return compare(self.question, choice, self.config.tracking, self.comparing)
 
     def needed(self, comparison: Comparison | None) -> dict[str, list[int]]:
-        """Return the seeds that each contender lacks for its next look; empty once there is none.
-
-        Raises:
-            Fault: more seeds would not help.
-        """
+        """Return the seeds that contenders lack for the next look. Raises: Fault if more would not help."""
         if comparison is None:
             lacking = {label: self.left(label, range(self.looks[0])) for label in self.contenders}
             return {label: seeds for label, seeds in lacking.items() if seeds}
@@ -209,16 +203,6 @@ class Contest:
         order = sorted((seed, at, label) for at, (label, seeds) in enumerate(needed.items()) for seed in seeds)
         return [self.job(label, seed) for seed, _, label in order]
 
-    def sweeps(self, needed: Mapping[str, Sequence[int]]) -> list[list[str]]:
-        """Return the command lines of the sweeps in which a launcher trains them: one, if all need the same seeds."""
-        parts = [(seeds, self.contenders[label][0]) for label, seeds in needed.items()]
-        if self.several and needed.keys() == self.contenders.keys() and len({tuple(seeds) for seeds, _ in parts}) == 1:
-            parts = [(parts[0][0], tuple(self.several))]
-        return [
-            ["train", "-m", *self.launcher, f"seed={','.join(map(str, seeds))}", *replaced(self._fixed, *overrides)]
-            for seeds, overrides in parts
-        ]
-
 
 def _said(overrides: Sequence[str]) -> str:
     return " ".join(overrides) or "the config without it"
@@ -227,7 +211,7 @@ def _said(overrides: Sequence[str]) -> str:
 def decide(contest: Contest, trained: Callable[[Job], int | None] | None = None) -> None:
     """Train the contenders' seeds in the order of the plan, look, drop what is decided, and say the answer.
 
-    trained: trains a job in this process, one after the other; None: as many at a time as the machine runs well.
+    trained: trains a job in this process, one after the other; None: the contest's launcher does.
 
     Raises:
         Fault: a training fails; the same command goes on.
@@ -238,50 +222,41 @@ def decide(contest: Contest, trained: Callable[[Job], int | None] | None = None)
     shown = labels(
         f"decide {' '.join(contest.several) or ' against '.join(contest.contenders)}", run_colour("decide"), "decision"
     )
+    is_first = True
     try:
         with terminable(), opened(contest.folder, tracking, contest.outputs, shown, contest.command) as journal:
-            say_what_it_takes(contest)
             while True:
                 comparison = contest.look()
                 if comparison is not None:
                     _write(journal, contest, comparison)
                 if not (needed := contest.needed(comparison)):
                     break
+                if is_first:
+                    say_what_it_takes(contest)
+                is_first = False
                 try:
-                    _train(contest, needed, trained)
+                    asked = contest.several, contest.command, contest.on_a_node
+                    launcher = BASIC if trained else contest.here
+                    sweep(contest.jobs(needed), launcher, *asked, trained or train)
+                    for label, seeds in needed.items():
+                        for seed in contest.left(label, seeds):
+                            raise Fault(f"run {contest.run(label, seed).name} has not ended")
                 except Fault as fault:
                     raise Fault(f"{fault}; {again}", fault.exit_code) from fault
     except (SystemExit, KeyboardInterrupt) as ended:
         terminal.warn(again)
         sys.exit(ended.code if isinstance(ended, SystemExit) else 130)
-    print(f"its runs again: {contest.comparing}")
     if comparison is not None:
+        if any(
+            each.decision.contenders and each.decision.looks[-1].size < contest.looks[-1] for each in comparison.answers
+        ):
+            error = contest.question.error
+            print(
+                f"Nothing is left of error={error:g} for a look at {contest.looks[-1]} seeds, so none is trained. "
+                f"To look further, allow a larger one, as in error={2 * error:g}"
+            )
+        print(f"its runs again: {contest.comparing}")
         terminal.document(comparison.document("decide").model_dump_json())
-
-
-def _train(contest: Contest, needed: Mapping[str, Sequence[int]], trained: Callable[[Job], int | None] | None) -> None:
-    if contest.launcher:
-        for arguments in contest.sweeps(needed):
-            with subprocess.Popen([sys.executable, "-m", "atlantis_exp", *arguments]) as sweep:
-                try:
-                    code = sweep.wait()
-                except BaseException:
-                    sweep.terminate()  # it has its jobs commit, and is waited for
-                    raise
-            if code:
-                raise Fault(f"a sweep ended with exit code {code}", exit_code=code if code > 0 else 128 - code)
-    else:
-        jobs, launcher = contest.jobs(needed), BASIC if trained else contest.here
-        with ledger(jobs, contest.several, launcher, contest.command):
-            if not launcher.is_basic:
-                train_side_by_side(jobs, launcher)
-            else:
-                for job in jobs:
-                    if (late := (trained or train)(job)) is not None:
-                        sys.exit(128 + late)
-    for label, seeds in needed.items():
-        for seed in contest.left(label, seeds):
-            raise Fault(f"run {contest.run(label, seed).name} has not ended")
 
 
 def say_what_it_takes(contest: Contest) -> None:

@@ -1,4 +1,4 @@
-"""What a session computes on: torch set up for its process, and the processor's name."""
+"""Set up torch for a session's process, and name its processor."""
 
 import platform
 from contextlib import suppress

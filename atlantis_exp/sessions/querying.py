@@ -1,4 +1,4 @@
-"""What the environment is (report figures 1.1 to 1.3)."""
+"""Describe the environment (report figures 1.1 to 1.3)."""
 
 import warnings
 

@@ -205,11 +205,7 @@ class Trials:
     def _score(self, trial: Trial, index: int, stop: StopRequest) -> float | None:
         """Train one of a trial's runs; return the mean of its last evaluation, None if `stop` ended it.
 
-        The last evaluation, since the best of several is the luckiest.
-
-        Raises:
-            TrialPruned: the trial was cut short, which its first run decides.
-            Fault: the run failed.
+        The best evaluation would be the luckiest. Raises: TrialPruned by the first run, Fault.
         """
         job = self.job(trial, index)
         # The time limit is the search's; an existing run is one that a killed process left.
@@ -254,10 +250,7 @@ class Trials:
         return self.asked.job_of([*replaced(self.asked.overrides, f"seed={seed}"), *_values(trial)])
 
     def conclusion(self) -> list[str]:
-        """Return the ranking's caveats and the commands that test its best values and train them in full.
-
-        `decide` trains other seeds, so that the luck of the search does not enter its answer.
-        """
+        """Return the ranking's caveats and the commands that test its best values, with other seeds, and train them."""
         if not (ranking := self.ranking):
             return []
         best, asked, lines = ranking[0][0], self.asked, []

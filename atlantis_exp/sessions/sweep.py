@@ -6,7 +6,7 @@ import tempfile
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from functools import partial
 from math import ceil
@@ -22,11 +22,12 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import TABLE_COLUMNS, TRACEBACK, RunFolder, State
 from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, Tracker, adopt
 from atlantis_exp.sessions.job import Job, fitted
-from atlantis_exp.sessions.launchers import BASIC, Launcher
+from atlantis_exp.sessions.launchers import BASIC, Launcher, in_turn
+from atlantis_exp.sessions.launchers.joblib import train_side_by_side
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.page import ending, opened, terminable
 from atlantis_exp.sessions.processor import set_up_torch
-from atlantis_exp.sessions.training import expected
+from atlantis_exp.sessions.training import expected, train
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.training.forecast import duration
 from atlantis_exp.training.plan import Counters
@@ -38,23 +39,46 @@ Runs = Mapping[RunFolder, Job]
 """The folders of a sweep's runs, each with its training."""
 
 
+def sweep(
+    jobs: Sequence[Job],
+    launcher: Launcher,
+    swept: Sequence[str],
+    command: str,
+    on_a_node: Callable[[Sequence[str]], None],
+    train: Callable[[Job], object] = train,
+) -> None:
+    """Train jobs by a launcher, with the table of their runs before and after.
+
+    Args:
+        swept: the overrides that name several values, as typed.
+        command: repeats the sweep.
+        on_a_node: trains a job of these overrides in a process of Slurm's.
+        train: trains a job in this process.
+
+    Raises:
+        Fault: another process runs the same sweep, or a training failed, once all have ended.
+    """
+    with ledger(jobs, swept, launcher, command):
+        match launcher.name:
+            case "joblib":
+                train_side_by_side(jobs, launcher)
+            case "slurm":
+                from atlantis_exp.sessions.launchers.slurm import submit
+
+                submit(jobs, launcher, on_a_node)
+            case _:
+                in_turn(train, jobs)
+
+
 @contextmanager
 def ledger(
     jobs: Sequence[Job], swept: Sequence[str] = (), launcher: Launcher = BASIC, command: str = ""
 ) -> Iterator[None]:
-    """Print a sweep's table of runs before and after it, and keep a page of it in MLflow (tracking=mlflow).
+    """Print a sweep's table of runs before and after the block, and keep its page (tracking=mlflow).
 
-    Where a launcher runs the jobs in other processes, these write their folders only: this one shows their progress,
-    publishes them, and, but for Slurm's, has them commit before it ends itself.
-
-    The runs know their parent from their folders, where it is noted before the first starts. The same set of runs is
-    the same parent again. However the block ends, the page is closed with it.
-
-    swept: the overrides that name several values, as typed.
-    command: what repeats the sweep.
-
-    Raises:
-        Fault: another process runs the same sweep.
+    Jobs in other processes write their folders only: this one shows their progress and publishes them. A run's folder
+    names its parent before the first run starts, and the same set of runs has the same parent again. Arguments and
+    faults as for `sweep`.
     """
     runs = {RunFolder.of(job.config): job for job in jobs}
     is_shown = not launcher.is_basic or jobs[0].config.tracking.name != "none"
@@ -148,21 +172,15 @@ def _page(runs: Runs, swept: Sequence[str], launcher: Launcher, command: str) ->
         describe = partial(_describe, journal, runs)
         describe()
         try:
-            with _every(_PAGE_SECONDS, describe), _launched(launcher, runs):
+            with ExitStack() as looks:
+                looks.enter_context(_every(_PAGE_SECONDS, describe))
+                if not launcher.is_basic:
+                    table = looks.enter_context(closing(LiveTable([*runs.values()], [*runs])))
+                    looks.enter_context(_every(table.seconds, table.look))
                 yield
         finally:
             _tabulate(journal, runs)
             describe()
-
-
-@contextmanager
-def _launched(launcher: Launcher, runs: Runs) -> Iterator[None]:
-    """Show the jobs of a launcher while it runs them."""
-    if launcher.is_basic:
-        yield
-        return
-    with closing(LiveTable([*runs.values()], [*runs])) as table, _every(table.seconds, table.look):
-        yield
 
 
 @contextmanager

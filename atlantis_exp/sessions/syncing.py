@@ -75,11 +75,7 @@ def tell(uri: str, all_sent: Iterable[Sent], is_first: bool) -> None:
 
 
 def publish_all(outputs: Path, store: Store, folders: Sequence[RunFolder] | None = None) -> Iterator[Sent]:
-    """Publish run folders, all under `outputs` by default, and yield how each ended.
-
-    Raises:
-        Fault: if the store is out of reach.
-    """
+    """Publish run folders, by default all under `outputs`, and yield how each ended. Raises: Fault for the store."""
     try:
         with terminal.working(f"asking {store.uri} for its runs"):
             listed = {run.info.run_id for run in store.runs()}

@@ -39,9 +39,9 @@ def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int |
 
     As a job of a sweep that another process runs, it writes the run's folder only: that process publishes it.
 
-    watch: asked after every step; where it says so, the run is committed and left to be continued.
+    watch: asked after every step; True commits the run and leaves it to be continued.
 
-    Returns the signal that came too late to stop it, None where none did: whoever has more to train stops now.
+    Returns a signal that came too late to stop it, after which no other training begins.
     """
     config, folder = job.config, RunFolder.of(job.config)
     if folder.status != "SCHEDULED":  # where a sweep has, its failure is to be recorded
@@ -84,7 +84,7 @@ def _labels(job: Job) -> dict[str, str]:
 
 
 def _has_ended(job: Job, folder: RunFolder) -> bool:
-    """Whether there is nothing to train, which is then said; puts a run aside that is to be started over."""
+    """Return whether there is nothing to train, and say so; put a run aside that is to be started over."""
     config = job.config
     if folder.result is not None and has_lost_commit(folder.path):
         with folder.held():
@@ -119,12 +119,7 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
 
 
 def _initial_weights(config: Config) -> Mapping[str, torch.Tensor] | None:
-    """The exported weights that a training begins with; None where it begins with random ones.
-
-    Raises:
-        ConfigError: where there are none, others than there were, or another network's.
-        Fault: where they are damaged.
-    """
+    """Return the exported weights that a training begins with; None: random ones. Raises: ConfigError, Fault."""
     if config.training.pinned is None:
         return None
     folder, digits = config.training.pinned
@@ -210,7 +205,7 @@ def _begin_with(job: Job, folder: RunFolder) -> str:
 
 
 def expected(trainer: Trainer, config: Config, done: Counters) -> Forecast:
-    """What the rest of a training will cost here; its parts are as before afterwards."""
+    """Return the cost of the rest of a training here, and leave its parts as they are."""
     return forecast(
         trainer,
         capacity=config.replay.capacity,
@@ -233,7 +228,7 @@ def _check_forecast(trainer: Trainer, config: Config, done: Counters, progress: 
 
 @contextmanager
 def _faults_recorded(job: Job, folder: RunFolder, journal: Journal) -> Iterator[None]:
-    """Write down why the block failed; a fault also says how to continue."""
+    """Record why the block failed; a fault also says how to continue."""
     try:
         yield
     except BaseException as error:
@@ -250,7 +245,7 @@ def _faults_recorded(job: Job, folder: RunFolder, journal: Journal) -> Iterator[
 
 
 def _close(trainer: Trainer, folder: RunFolder, journal: Journal, outcome: Outcome) -> Result:
-    """Say how the session has ended and, where the run has, keep its result."""
+    """Record how the session ended and, if the run did, its result."""
     counters, recorder = trainer.counters, trainer.recorder
     counts = {
         "episodes": counters.episodes,

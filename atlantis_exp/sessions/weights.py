@@ -1,4 +1,4 @@
-"""The weights that a stored run has: of its last commit, or of its best evaluation as of that commit."""
+"""Read the weights of a stored run: of its last commit, or of its best evaluation until then."""
 
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import ARTIFACT, is_whole, read_file
@@ -9,12 +9,9 @@ from atlantis_exp.training.plan import Counters
 
 
 def stored_weights(run: RunFolder, weights: str) -> tuple[bytes, int]:
-    """A stored run's network as safetensors, and its step; weights: `latest` or `best`.
+    """Return a stored run's network as safetensors, and its step; weights: `latest` or `best`. Raises: Fault.
 
-    A folder without checkpoints, as one that was copied without them, has the weights of its evaluations.
-
-    Raises:
-        Fault: where the run has no such weights, or they are not those that were committed.
+    A folder that was copied without checkpoints has the weights of its evaluations.
     """
     try:
         state = Checkpoints(run.checkpoints, run.trained_config.identity()).load()
@@ -37,7 +34,7 @@ def stored_weights(run: RunFolder, weights: str) -> tuple[bytes, int]:
 
 
 def _read(run: RunFolder, path: str, sha256: str) -> bytes:
-    """An artifact with weights. Raises: Fault."""
+    """Return an artifact with weights. Raises: Fault."""
     try:
         content = read_file(file := run.artifact(path), ARTIFACT)
     except (OSError, ValueError) as error:

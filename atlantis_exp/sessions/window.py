@@ -11,11 +11,7 @@ if TYPE_CHECKING:
 
 
 class Window:
-    """A pygame window that shows screens at the game's speed and reads actions from the keys.
-
-    Raises:
-        Fault: pygame or a screen is missing.
-    """
+    """A pygame window that shows screens at the game's speed and reads actions from the keys. Raises: Fault."""
 
     def __init__(self, title: str, game: Game, steps_per_second: float, scale: int) -> None:
         try:

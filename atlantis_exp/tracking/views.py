@@ -30,7 +30,7 @@ _COLUMNS = (
 START, SWEEP, COMPARISONS = "start", "sweep", "comparisons"
 """The keys of the shared views, as `viewStateShareKey` in an address takes them."""
 
-_NO_PLAYERS = ("training sweep", "search", "decision", "comparison", "verification")
+_NO_PLAYERS = ("training sweep", "search", "decision", "comparison")
 """Kinds of runs without a game of their own."""
 
 _ABOUT = """\

@@ -4,6 +4,7 @@ import csv
 import itertools
 import json
 import math
+import signal
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
@@ -185,6 +186,34 @@ def test_store_measures_every_command_over_many_runs(
         assert results[f"{command}_s"] > 0, command
         assert results[f"{command}_mib"] > 0, command
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("number", "end"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
+def test_a_session_does_not_outlive_the_one_who_would_kill_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, end: type[BaseException]
+) -> None:
+    sessions: list[kills.Session] = []
+
+    def start_one(said: Path) -> kills.Session:
+        sessions.append(kills.start(("sleep", "60"), said))
+        return sessions[0]
+
+    looks = iter([0])
+
+    def generations(*_: object) -> int:
+        for look in looks:
+            return look
+        signal.raise_signal(number)
+        return 0
+
+    monkeypatch.setattr(kills, "generations", generations)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in what a shell runs in the background
+    try:
+        with pytest.raises(end):
+            kills.run_and_kill(start_one, tmp_path, "*", 1)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert sessions[0].wait() == -signal.SIGKILL
 
 
 @pytest.mark.slow

@@ -131,7 +131,7 @@ def test_showing_the_config_prints_one_that_is_valid_and_leaves_nothing_behind(
 def test_nothing_heavy_is_loaded_before_the_config_is_checked() -> None:
     program = (
         "import sys; from importlib import import_module; from atlantis_exp import config; "
-        f"[import_module(f'atlantis_exp.commands.{{verb}}') for verb in {[verb.replace('-', '_') for verb in VERBS]}]; "
+        f"[import_module(f'atlantis_exp.commands.{{verb}}') for verb in {[*VERBS]}]; "
         "from atlantis_exp.commands.overrides import check; "
         "check('config', config.Config, ['model=resnet']); print(*sys.modules)"
     )

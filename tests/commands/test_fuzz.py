@@ -66,7 +66,7 @@ def line_of(rng: random.Random, verb: str) -> list[str]:
 
 def refusal_of(name: str, words: list[str]) -> str | None:
     """What a command line is refused with, None where it is taken; all but the work is done."""
-    verb: Verb[Any] = importlib.import_module(f"atlantis_exp.commands.{name.replace('-', '_')}").VERB
+    verb: Verb[Any] = importlib.import_module(f"atlantis_exp.commands.{name}").VERB
     try:
         typed = located(words)
         arguments = verb.rewrite(list(typed))

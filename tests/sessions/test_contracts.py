@@ -14,11 +14,12 @@ from atlantis_exp.commands.overrides import check
 from atlantis_exp.components import KINDS, admit
 from atlantis_exp.config import Config
 from atlantis_exp.faults import Fault
+from atlantis_exp.sessions.contracts import _train, contracts_of
 from atlantis_exp.sessions.contracts import check as check_contracts
-from atlantis_exp.sessions.contracts import contracts_of
 from atlantis_exp.sessions.job import Job, replaced
 
 Command = Callable[..., int]
+Compose = Callable[..., Config]
 
 PARTS = """
 import random
@@ -159,6 +160,26 @@ def test_components_that_are_named_are_tried_and_no_others(
     contracts, jobs = call.args
     assert {part for part, *_ in contracts} == {*tried, "all"}
     assert [*jobs] == measured
+
+
+def test_a_training_that_fails_amid_the_contracts_is_said_with_its_last_line(tmp_path: Path, tiny: Compose) -> None:
+    with pytest.raises(Fault, match=r"a session failed: .*model=none: no such option"):
+        _train(Job(tiny(), overrides=("model=none",)), tmp_path)
+
+
+@pytest.mark.slow
+def test_a_training_that_is_continued_otherwise_breaks_the_contract(
+    tmp_path: Path, tiny_overrides: tuple[str, ...]
+) -> None:
+    lost = PARTS.replace('{"drawn": self.drawn}', '{"drawn": 0}', 1)
+    (tmp_path / "mine.py").write_text(lost)
+    words = [*tiny_overrides, f"plugins={tmp_path / 'mine.py'}", "sampler=mine"]
+    ((overrides, config),) = check("config", Config, words).items()
+    call: Any = _work(Asked(config, "check", overrides))
+    *_, (part, _, resumes) = call.args[0]
+    assert part == "all"
+    with pytest.raises(Fault, match="differ"):
+        resumes()
 
 
 @pytest.mark.slow

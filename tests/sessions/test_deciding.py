@@ -179,50 +179,47 @@ def test_what_stops_a_training_stops_its_decision_with_the_same_code(
         assert capsys.readouterr().err == ("" if reason else f"atlantis_exp: {again}\n")
 
 
-def test_a_launcher_is_given_one_sweep_where_all_need_the_same_seeds_else_one_each(
-    asking: Asking, recorded: Recorded
+def test_only_seeds_that_are_missing_are_trained_the_contenders_in_turns(asking: Asking, recorded: Recorded) -> None:
+    contest = asking("model=cnn,resnet", "seeds=5")
+    record_seeds(recorded, 1_000, range(4), "model=cnn")
+    needed = contest.needed(None)
+    assert needed == {"cnn": [4], "resnet": [0, 1, 2, 3, 4]}
+    jobs = [(job.config.model.name, job.config.seed) for job in contest.jobs(needed)]
+    assert jobs == [*(("resnet", seed) for seed in range(4)), ("cnn", 4), ("resnet", 4)]
+
+
+def test_a_plan_whose_error_is_spent_trains_nothing_and_says_how_to_go_on(
+    asking: Asking, recorded: Recorded, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    contest = asking("model=cnn,resnet", "seeds=5")
-    contest.launcher = ("hydra/launcher=joblib",)
-    needed = contest.needed(None)
-    assert needed == {"cnn": [0, 1, 2, 3, 4], "resnet": [0, 1, 2, 3, 4]}
-    begin = ["train", "-m", "hydra/launcher=joblib"]
-    (sweep,) = contest.sweeps(needed)
-    assert [*sweep[:4], sweep[-1]] == [*begin, "seed=0,1,2,3,4", "model=cnn,resnet"]
-    assert "env.size=40" in sweep
-    assert not any(text.startswith("seeds=") for text in sweep)
-    record_seeds(recorded, 1_000, range(2), "model=cnn")
-    needed = contest.needed(None)
-    assert needed == {"cnn": [2, 3, 4], "resnet": [0, 1, 2, 3, 4]}
-    sweeps = contest.sweeps(needed)
-    assert [(sweep[3], sweep[-1]) for sweep in sweeps] == [
-        *(("seed=2,3,4", "model=cnn"), ("seed=0,1,2,3,4", "model=resnet"))
-    ]
-    record_seeds(recorded, 1_000, range(2, 5), "model=cnn")
-    (sweep,) = contest.sweeps(contest.needed(None))
-    assert (sweep[3], sweep[-1]) == ("seed=0,1,2,3,4", "model=resnet")
+    def train(job: Job) -> None:
+        raise AssertionError(job)
 
-
-def test_a_sweep_of_a_launcher_that_fails_ends_the_decision_with_its_code(asking: Asking) -> None:
-    contest = asking("model=cnn,resnet", "seeds=5")
-    contest.launcher = ("hydra/launcher=nobody",)
-    with pytest.raises(Fault, match=r"^a sweep ended with exit code 2; the decision goes on with: ") as failed:
-        decide(contest)
-    assert failed.value.exit_code == 2
+    for model in ("cnn", "resnet"):
+        record_seeds(recorded, 1_000, range(10), f"model={model}")
+    for seeds, left in ((10, ""), (20, "Nothing is left of error=0.05 for a look at 20 seeds, so none is trained. ")):
+        decide(asking("model=cnn,resnet", f"seeds={seeds}"), train)
+        shown = capsys.readouterr().out
+        assert "Not decided: cnn against resnet" in shown
+        assert "is found" not in shown  # a forecast
+        assert ("Nothing is left" in shown) == bool(left)
+        assert left in shown
+    contest = asking("model=cnn,resnet", "seeds=20", "error=0.1")
+    with pytest.raises(AssertionError):
+        decide(contest, train)
+    assert "of the score is found with 80 % at 20 seeds" in " ".join(capsys.readouterr().out.split())
 
 
 def test_several_keys_at_once_are_two_contenders(asking: Asking) -> None:
     contest = asking("against=optimizer=rmsprop,optimizer.lr=0.002", "optimizer=adam", "seeds=5")
     assert list(contest.contenders) == ["lr=0.001 adam", "lr=0.002 rmsprop"]
-    (_, one), (_, other) = contest.contenders.values()
+    one, other = contest.contenders.values()
     assert (one.config.optimizer.name, one.config.optimizer.lr) == ("adam", 0.001)
     assert (other.config.optimizer.name, other.config.optimizer.lr) == ("rmsprop", 0.002)
     assert [family.name for family in contest.families] == ["optimizer.lr,optimizer"]
-    contest.launcher = ("hydra/launcher=joblib",)
-    one_sweep, other_sweep = contest.sweeps(contest.needed(None))
-    assert "optimizer=adam" in one_sweep
-    assert other_sweep[-2:] == ["optimizer=rmsprop", "optimizer.lr=0.002"]
-    assert "optimizer=adam" not in other_sweep
+    texts = {label: contest.job(label, 3).overrides for label in contest.contenders}
+    assert "optimizer=adam" in texts["lr=0.001 adam"]
+    assert {"optimizer=rmsprop", "optimizer.lr=0.002", "seed=3"} < {*texts["lr=0.002 rmsprop"]}
+    assert "optimizer=adam" not in texts["lr=0.002 rmsprop"]
 
 
 @pytest.mark.slow

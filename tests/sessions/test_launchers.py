@@ -20,12 +20,12 @@ from atlantis_exp.config import Config, PathsConfig
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal, read_commit
+from atlantis_exp.sessions.contracts import fingerprints
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.launchers import BASIC, Launcher
 from atlantis_exp.sessions.launchers.joblib import fitted, fitting, shared, train_side_by_side
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.training import train
-from atlantis_exp.sessions.verifying import fingerprints
 
 REPOSITORY = Path(__file__).parents[2]
 FREQUENT = ("tracking=mlflow", "tracking.commit_seconds=0.5", "evaluation.every_steps=null")

@@ -236,7 +236,7 @@ def test_the_best_is_called_lucky_and_tested_against_the_default_with_other_seed
     assert not any(text.startswith(("seed=", "budget.wall_clock=")) for text in typed)
     ((texts, config),) = check("decide", DecideConfig, DECIDE.rewrite(typed[1:])).items()
     contest = contest_of(Asked(config, "decide", texts, typed=tuple(typed[1:])))
-    (_, default), (_, best) = contest.contenders.values()
+    default, best = contest.contenders.values()
     assert default.config.optimizer.name == "adamw"
     assert best.config.science() == {
         **Trials(request).job(Trials(request).ranking[0][0], 0).config.science(),

@@ -26,11 +26,10 @@ from atlantis_exp.machine import Machine
 from atlantis_exp.runs.facts import read_facts
 from atlantis_exp.runs.folder import RunFolder, find_run
 from atlantis_exp.runs.journal import Artifact, Image, Journal, Metrics, Model, adopt, read
-from atlantis_exp.sessions import verifying
+from atlantis_exp.sessions.contracts import fingerprints
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.reporting import report
 from atlantis_exp.sessions.training import _kin, train
-from atlantis_exp.sessions.verifying import Session, fingerprints, run_and_kill, start, train_and_kill
 from atlantis_exp.tracking.mirror import publish
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.tracking.store import Store
@@ -38,6 +37,7 @@ from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints
 from atlantis_exp.training.forecast import Forecast
 from atlantis_exp.training.plan import Counters
 from atlantis_exp.training.trainer import Trainer
+from benchmarks.kills import train_and_kill
 
 Compose = Callable[..., Config]
 Served = Callable[[Path, int], AbstractContextManager[None]]
@@ -338,34 +338,6 @@ def test_a_run_that_is_made_longer_is_done_at_its_new_end(recorded: Callable[...
         journal.status(status)
         states.append(folder.state)
     assert states == ["done", "running", "interrupted", "interrupted", "failed", "done"]
-
-
-@pytest.mark.parametrize(("number", "end"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
-def test_a_session_does_not_outlive_the_one_who_would_kill_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, end: type[BaseException]
-) -> None:
-    sessions: list[Session] = []
-
-    def start_one(said: Path) -> Session:
-        sessions.append(start(("sleep", "60"), said))
-        return sessions[0]
-
-    looks = iter([0])
-
-    def generations(*_: object) -> int:
-        for look in looks:
-            return look
-        signal.raise_signal(number)
-        return 0
-
-    monkeypatch.setattr(verifying, "generations", generations)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in what a shell runs in the background
-    try:
-        with pytest.raises(end):
-            run_and_kill(start_one, tmp_path, "*", 1)
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert sessions[0].wait() == -signal.SIGKILL
 
 
 def test_resume_must_refuses_to_start_and_resume_never_keeps_what_was_there(tiny: Compose) -> None:
@@ -803,18 +775,3 @@ def test_a_machine_that_cannot_compile_is_told_in_one_line(tiny_overrides: tuple
     assert "torch.compile failed, InvalidCxxCompiler" in done.stderr.splitlines()[-1]
     assert done.stderr.splitlines()[-1].endswith("compile=false does without")
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.slow
-def test_verify_resume_records_its_verdict(tiny_overrides: tuple[str, ...], tmp_path: Path) -> None:
-    overrides = replaced(
-        tiny_overrides, "phase.quick.steps=4_000", "evaluation.every_steps=null", f"paths.outputs={tmp_path}"
-    )
-    done = subprocess.run(
-        (*COMMAND, "verify-resume", *overrides), cwd=REPOSITORY, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1].endswith("is the unbroken one, bit for bit")
-    [path] = (tmp_path / "verifications").glob("*/artifacts/fingerprints.json")
-    hashes = json.loads(path.read_bytes())
-    assert hashes["unbroken"] == hashes["killed"]

@@ -21,11 +21,11 @@ from atlantis_exp.commands.overrides import check
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.sessions.contracts import fingerprints
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.launchers import Launcher
 from atlantis_exp.sessions.launchers.slurm import submit
 from atlantis_exp.sessions.training import train
-from atlantis_exp.sessions.verifying import fingerprints
 
 Compose = Callable[..., Config]
 REPOSITORY = Path(__file__).parents[2]

@@ -1,7 +1,10 @@
 """The launchers that run a sweep's trainings in other processes: joblib on this machine, Slurm on a cluster."""
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple, TypeVar
+
+T = TypeVar("T")
 
 
 class Launcher(NamedTuple):
@@ -17,3 +20,21 @@ class Launcher(NamedTuple):
 
 
 BASIC = Launcher()
+
+
+def in_turn(work: Callable[[T], object], jobs: Iterable[T]) -> None:
+    """Do jobs one after the other, also after an error; raise the first error at the end.
+
+    A signal that came too late to stop a job ends the process after it.
+    """
+    first: Exception | None = None
+    for job in jobs:
+        try:
+            late = work(job)
+        except Exception as error:
+            first = first or error
+        else:
+            if isinstance(late, int):
+                sys.exit(128 + late)
+    if first is not None:
+        raise first

@@ -83,11 +83,7 @@ def _memory(config: Config) -> int:
 
 
 def train_side_by_side(jobs: Sequence[Job], launcher: Launcher) -> None:
-    """Train jobs, as many at a time as the launcher says and the cores divided among them.
-
-    Raises:
-        Fault: the first job's that failed, once all have ended.
-    """
+    """Train as many jobs at a time as the launcher says. Raises: the first job's Fault, once all have ended."""
     at_once, share = shared(all_cores(), launcher.settings["n_jobs"], jobs)
     # A person's own number of threads goes before, but for one that would have each job take the whole machine.
     share = min(launcher.settings.get("cores", share), here().cores)
