@@ -15,14 +15,7 @@ import numpy as np
 from atlantis_exp import documents
 from atlantis_exp.comparison.account import Account
 from atlantis_exp.comparison.choosing import plays_alike
-from atlantis_exp.comparison.decision import (
-    FEWEST_SEEDS,
-    Plan,
-    Verdict,
-    decide,
-    equal_scores,
-    mean_interval,
-)
+from atlantis_exp.comparison.decision import FEWEST_SEEDS, Plan, Verdict, decide, mean_interval
 from atlantis_exp.comparison.gather import AXES, Array, Gathered, Player, Training
 from atlantis_exp.comparison.notes import CAVEATS, NOTES, Facts
 from atlantis_exp.comparison.published import Row, Table, curves, scores
@@ -134,7 +127,7 @@ def compare(
         "why": [_why(label, runs, game.sources) for label, runs in groups.items()],
         "improvement": _improvement(groups),
         "views": _views(groups),
-        "runs": [row for label, runs in groups.items() for row in _runs(label, runs)],
+        "runs": _runs(groups),
         "curves": [row for axis in AXES for label, runs in groups.items() for row in _curve(axis, label, runs)],
         "seed_curves": [
             row for axis in AXES for label, runs in groups.items() for row in _seed_curves(axis, label, runs)
@@ -276,12 +269,12 @@ def _why(label: str, runs: Sequence[Training], sources: Sequence[str]) -> Row:
     }
 
 
-def _runs(label: str, runs: Sequence[Training]) -> Table:
-    alike = equal_scores({run.name: run.episodes.scores.tolist() for run in runs})
-    same = {name: first for first, *others in alike for name in others}
+def _runs(groups: Groups) -> Table:
+    first: dict[bytes, str] = {}  # run with these scores, in the order of the episodes
     table = []
-    for training in runs:
+    for label, training in ((label, training) for label, runs in groups.items() for training in runs):
         summary = summarize(training.episodes.scores)
+        same_as = first.setdefault(training.episodes.scores.tobytes(), training.name)
         table.append(
             {
                 "run": training.name,
@@ -296,7 +289,7 @@ def _runs(label: str, runs: Sequence[Training]) -> Table:
                 "low": summary.low,
                 "high": summary.high,
                 "policy": training.policy,
-                "same_as": same.get(training.name, ""),
+                "same_as": same_as if same_as != training.name else "",
             }
         )
     return table

@@ -9,7 +9,8 @@ from atlantis_exp.comparison.decision import Plan, Verdict
 from atlantis_exp.comparison.verdict import Answer, Question
 
 IN_FULL = 3  # pairs of a family, up to which each is said with its interval
-_LISTED = 6  # undecided pairs or runs, up to which they are named
+_LISTED = 6  # undecided pairs, up to which they are named
+_NAMED = 3  # of many runs
 
 
 def measure(question: Question) -> str:
@@ -98,9 +99,9 @@ def margin(plan: Plan) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names in a row, the first few of many."""
-    more = len(names) - _LISTED
-    return ", ".join(names[:_LISTED]) + (f" and {more} more" if more > 0 else "")
+    """Return names in a row, the first three of many."""
+    more = len(names) - _NAMED
+    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _gap(verdict: Verdict, other: str, in_full: bool, turned: bool) -> str:
