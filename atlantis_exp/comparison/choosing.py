@@ -92,12 +92,12 @@ def mixed_protocol(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) 
     """
     games = {name: title_of(config["env.id"]) for name, config in configs.items()}
     if len(set(games.values())) > 1:
-        return "game", f"env.id differs: scores of different games are not compared: {_holders(games)}"
+        return "game", f"env.id differs: scores of different games are not compared: {holders(games)}"
     asked = {resolve(key, config) for key in by for config in configs.values()}
     for key in PROTOCOL:
         values = {name: json.dumps(config[key]) for name, config in configs.items()}
         if key not in asked and len(set(values.values())) > 1:
-            return key, f"{key} differs, so the scores do not mean the same: {_holders(values)}"
+            return key, f"{key} differs, so the scores do not mean the same: {holders(values)}"
     return None
 
 
@@ -115,8 +115,8 @@ def refuse_mixed_protocols(trainings: Sequence[Training], by: Sequence[str]) -> 
     raise ConfigError(f"{sentence}; {hints.get(key, f'choose with runs= or where=, or ask for it with by={key}')}")
 
 
-def _holders(values: Mapping[str, str]) -> str:
-    """Say which names have which value."""
+def holders(values: Mapping[str, str]) -> str:
+    """Say which names have which value: the first of them, and how many more."""
     names = defaultdict(list)
     for name, value in values.items():
         names[value].append(name)

@@ -9,14 +9,14 @@ that share a group. They do not hold if the scores say when to look, or if group
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import nctdtr, stdtrit
 
+from atlantis_exp.documents import Said
 from atlantis_exp.statistics import probability_of_improvement
 
 Values = npt.NDArray[np.float64]
@@ -61,12 +61,24 @@ class Verdict:
 
     group: str
     other: str
-    said: Literal["better", "worse", "equivalent", "not decided"] = "not decided"  # of the group, against the other
+    said: Said = "not decided"  # of the group, against the other
     difference: float = np.nan
     low: float = np.nan
     high: float = np.nan
     seeds: int = 0  # of each of the two groups, that it rests on
     detectable: float | None = None  # the difference found with 80 % at these spreads; after the last look, undecided
+
+    @property
+    def turned(self) -> "Verdict":
+        """The same of the other group, against this one."""
+        said: Said = {"better": "worse", "worse": "better"}.get(self.said, self.said)  # type: ignore[assignment]
+        of = {"group": self.other, "other": self.group, "difference": -self.difference}
+        return replace(self, said=said, low=-self.high, high=-self.low, **of)  # type: ignore[arg-type]
+
+    @property
+    def leading(self) -> "Verdict":
+        """It, seen from the group with the higher mean."""
+        return self if self.difference > 0 else self.turned
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from math import isclose, nan
 from statistics import fmean, variance
 
 from atlantis_exp.comparison.account import seeds_between
-from atlantis_exp.comparison.choosing import COMMIT, resolve, values_in
+from atlantis_exp.comparison.choosing import COMMIT, holders, resolve, values_in
 from atlantis_exp.comparison.decision import (
     Look,
     Verdict,
@@ -80,7 +80,7 @@ def further_answers(facts: Facts) -> Iterator[str]:
         plan, pairs = answer.family.plan, len(answer.decision.verdicts)
         if pairs > IN_FULL:
             continue
-        one, other = _better_first(verdict)
+        one, other = verdict.leading.group, verdict.leading.other
         seeds = {name: [answer.family.seeds[name][seed] for seed in look.seeds[name]] for name in (one, other)}
         low, share, high = improvement(*seeds.values())
         said = [f"A seed of {one} beats one of {other} with {share:.0%} ({low:.0%} to {high:.0%})"]
@@ -88,9 +88,9 @@ def further_answers(facts: Facts) -> Iterator[str]:
             base = fmean(seeds[plan.baseline] if plan.baseline else map(fmean, seeds.values()))
             delta = (plan.delta or 0.0) * (abs(base) if plan.relative else 1)
             said += [
-                f"{name} is no worse by more than {margin(plan)}"
-                for name, low in ((verdict.group, verdict.low), (verdict.other, -verdict.high))
-                if delta and low > -delta
+                f"{of.group} is no worse by more than {margin(plan)}"
+                for of in (verdict, verdict.turned)
+                if delta and of.low > -delta
             ]
             if verdict.difference and (spread := fmean(map(variance, seeds.values())) ** 0.5):
                 needed = seeds_needed(verdict.difference, spread, plan.error, pairs) or "more than 1,000"
@@ -102,7 +102,7 @@ def conditions(facts: Facts) -> Iterator[str]:
     """Say how much a look overstates each difference, and which collapse would undo its verdict."""
     for answer, look, verdict in _looked_at(facts):
         if verdict.said in ("better", "worse"):
-            one, other = _better_first(verdict)
+            one, other = verdict.leading.group, verdict.leading.other
             found = condition(verdict, look, answer.family.seeds)
             yield (
                 f"{one} against {other}: a look overstates what it finds; the true difference is rather "
@@ -119,11 +119,6 @@ def _looked_at(facts: Facts) -> Iterator[tuple[Answer, Look, Verdict]]:
         for pair, (look, verdict) in last.items():
             if all({*look.seeds[name]} <= answer.family.seeds[name].keys() for name in pair):
                 yield answer, look, verdict
-
-
-def _better_first(verdict: Verdict) -> tuple[str, str]:
-    pair = verdict.group, verdict.other
-    return pair if verdict.difference > 0 else pair[::-1]
 
 
 def unusual_runs(facts: Facts) -> Iterator[str]:
@@ -191,12 +186,9 @@ def unlike(facts: Facts) -> Iterator[str]:
     if not {"budget.steps", "budget.flops"} & set(facts.by):
         subjects["not trained equally long"] = _ended_by
     for how, value in subjects.items():
-        holders = defaultdict(list)
-        for run in facts.trainings:
-            holders[value(run)].append(run.name)
-        if len(holders) > 1:
-            named = "; ".join(f"{value}: {listed(names)}" for value, names in sorted(holders.items()))
-            yield f"The runs were {how}: {named}."
+        values = {run.name: value(run) for run in facts.trainings}
+        if len({*values.values()}) > 1:
+            yield f"The runs were {how}: {holders(values)}."
 
 
 def _ended_by(run: Training) -> str:
