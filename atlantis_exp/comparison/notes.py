@@ -75,7 +75,7 @@ def further_answers(facts: Facts) -> Iterator[str]:
     for answer in facts.answers:
         plan, best = answer.family.plan, may_be_best(answer.decision)
         if plan.baseline is None and 1 < len(best) < len(answer.family.seeds):
-            yield f"By {answer.family.name}, with {1 - plan.error:.0%} the best is one of {listed(best)}."
+            yield f"By {answer.family.name}, with {1 - plan.error:.0%} the best is one of {', '.join(best)}."
     for answer, look, verdict in _looked_at(facts):
         plan, pairs = answer.family.plan, len(answer.decision.verdicts)
         if pairs > IN_FULL:

@@ -1,8 +1,6 @@
 """Turn a question about groups of runs into families of pairs, and decide each.
 
-A seed's *score* is what `Question.score` says, a group's the mean over its seeds. No other quantity is decided about.
-`families` says what is compared with what, `answer` takes the looks that are due, and `wanted` returns the seeds that
-the next looks need.
+A seed's *score* is what `Question.score` says, a group's the mean over its seeds. Verdicts are about nothing else.
 """
 
 from collections import defaultdict

@@ -861,6 +861,8 @@ def test_an_open_pair_says_which_group_is_no_worse_by_more_than_delta() -> None:
     assert said(delta=60.0) == ["b is no worse by more than 60 points"]
     assert said(delta=0.06, relative=True) == ["b is no worse by more than 6 %"]
     assert said(delta=0.06, relative=True, baseline="b") == ["b is no worse by more than 6 %"]
+    (verdict,) = compared(runs, error=0.01, baseline="b").tables["verdict"]
+    assert said(delta=verdict["high"] / 1_028, relative=True, baseline="b")  # b's mean is 1,038, both's 1,018
     assert said(delta=5.0) == []
     assert said(delta=0.005, relative=True) == []
 
