@@ -45,10 +45,10 @@ class CompareConfig:
     def __post_init__(self) -> None:
         margin(self.delta)
         share("window", self.window)
-        of_runs = {"by": self.by != ["model"], "score": self.score != "last", "at_epsilon": self.at_epsilon is not None}
-        of_runs |= {"runs": bool(self.runs), "where": bool(self.where)}
-        if self.scores is not None and (key := next((key for key, is_asked in of_runs.items() if is_asked), None)):
-            raise ConfigError(f"{key}: is of runs, not of scores={self.scores}, grouped by columns=group=NAME")
+        of_runs = {"by": ["model"], "score": "last", "at_epsilon": None, "runs": [], "where": []}  # unless asked
+        for key, value in of_runs.items() if self.scores is not None else ():
+            if getattr(self, key) != value:
+                raise ConfigError(f"{key}: is of runs, not of scores={self.scores}, grouped by columns=group=NAME")
         named(self.columns)
 
     @property
@@ -62,7 +62,7 @@ class CompareConfig:
 
 
 def margin(delta: str | float | None) -> tuple[float | None, bool]:
-    """A difference that does not matter, and whether it is a share of a score. Raises: ConfigError."""
+    """Return the difference that does not matter, and whether it is a share of a score. Raises: ConfigError."""
     if delta is None:
         return None, False
     text = delta if isinstance(delta, str) else f"{delta:.15g}"
@@ -91,7 +91,7 @@ def list_out(arguments: list[str]) -> list[str]:
 
 
 def as_texts(arguments: Iterable[str]) -> list[str]:
-    """Arguments with the baseline in quotes, without which Hydra refuses `lr=0.001` and makes a commit a number."""
+    """Put the baseline in quotes: else Hydra refuses `lr=0.001` and reads a commit as a number."""
     return [re.sub(r"^baseline=(?!null$)([^'\"]+)$", r"baseline='\1'", argument) for argument in arguments]
 
 

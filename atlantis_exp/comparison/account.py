@@ -7,11 +7,11 @@ groups, alone or among others, and is told what other questions about any of its
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 from pydantic import TypeAdapter
 
-from atlantis_exp.comparison.decision import Look, Verdict
+from atlantis_exp.comparison.decision import Look
 from atlantis_exp.comparison.gather import UNREADABLE
 from atlantis_exp.comparison.looks import RECORD, Record, read_looks
 from atlantis_exp.comparison.verdict import Family
@@ -58,19 +58,14 @@ class Asked:
         """Which score it is about, and which difference does not matter."""
         return self.score, self.window, self.delta, self.relative, self.relative and self.baseline
 
-    def shares_runs(self, other: "Asked") -> bool:
-        """Return whether both were asked of a run, or of the same table."""
-        return bool({*self.compared} & {*other.compared}) or bool(self.scores and self.scores == other.scores)
-
-    @property
-    def sizes(self) -> set[int]:
-        """The numbers of seeds of its looks."""
-        return {look.size for looks in self.record.values() for look in looks}
-
     @property
     def spent(self) -> float:
         """The error that its looks spent."""
         return sum(look.error for looks in self.record.values() for look in looks)
+
+    def shares_runs(self, other: "Asked") -> bool:
+        """Return whether both were asked of a run, or of the same table."""
+        return bool({*self.compared} & {*other.compared}) or bool(self.scores and self.scores == other.scores)
 
 
 @dataclass(frozen=True)
@@ -86,9 +81,9 @@ class Account:
 
     def limit(self, asked: Sequence[Family]) -> list[Family]:
         """Return the families with the error that the account leaves them."""
+        left = [self.errors.get(family.name, family.plan.error) for family in asked]
         return [
-            replace(family, plan=replace(family.plan, error=self.errors.get(family.name, family.plan.error)))
-            for family in asked
+            replace(family, plan=replace(family.plan, error=error)) for family, error in zip(asked, left, strict=True)
         ]
 
     @property
@@ -109,22 +104,18 @@ def read_account(
     others, damaged = [], []
     for path in sorted(folder.path.parent.glob(f"*/{LOOKS}")):
         if path.parent != folder.path:
-            other = RunFolder(path.parent)
             try:
-                others.append(replace(_read(other), record=RECORD.validate_json(read_file(path, SMALL), strict=True)))
+                other = _read(RunFolder(path.parent))
+                others.append(replace(other, record=RECORD.validate_json(read_file(path, SMALL), strict=True)))
             except UNREADABLE:
-                damaged.append(other.name)
+                damaged.append(path.parent.name)
     try:
         before = _read(folder)
         loose: Collection[str] = before.errors
     except UNREADABLE:  # before its first look, or killed while it wrote
         before, loose = _ASKED.validate_python({**question, "compared": []}), {family.name for family in asked}
-    mine = replace(
-        before,
-        name=folder.name,
-        compared=sorted({*before.compared, *runs}),
-        record=read_looks(folder.path, asked, loose),
-    )
+    compared, record = sorted({*before.compared, *runs}), read_looks(folder.path, asked, loose)
+    mine = replace(before, name=folder.name, compared=compared, record=record)
     found = open_account(asked, mine, others, runs)
     if damaged:
         line = f"What these comparisons spent is unknown, since they cannot be read: {listed(damaged)}."
@@ -135,8 +126,8 @@ def read_account(
 def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], runs: Collection[str]) -> Account:
     """Return the account of a question.
 
-    Each family takes over the longest looks of an earlier question with the same measure and all its pairs, as
-    long as they go on from its own. Of what that question has left it may spend the share of its open pairs.
+    Each family takes over the longest looks of an earlier question with the same measure and all its pairs, if they
+    begin with its own. Of the error that question has left it may spend the share of its open pairs.
 
     Args:
         mine: the question, with its own looks so far and all runs that it was ever asked of.
@@ -147,28 +138,28 @@ def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], 
     record, errors, roots, lines = dict(mine.record), dict(mine.errors), [], []
     for family in asked:
         own = mine.record.get(family.name, [])
-        parts = [(part, other) for other in others if (part := _part(family, asked, mine, other)) is not None]
+        parts = [(part, other) for other in others if (part := _part(family, asked, mine, other))]
         parts = [(part, other) for part, other in parts if part.looks[: len(own)] == own]
-        if parts:
-            part, other = max(parts, key=lambda found: len(found[0].looks))
-            record[family.name], errors[family.name] = part.looks, part.error
-            roots.append(other.root)
-            if other.root != mine.name:
-                of = "" if part.of == 1 else f", of whose {part.of} pairs it is a part"
-                is_open = any(verdict.said == "not decided" for verdict in part.looks[-1].verdicts)
-                is_spent = part.error - sum(look.error for look in part.looks) < 1e-9
-                left = "; to look further, allow a larger error=" if is_open and is_spent else ""
-                lines.append(f"By {family.name}, this continues the looks of {other.name}{of}{left}.")
-        else:
+        if not parts:
             roots.append(mine.root if family.name in errors else mine.name)
+            continue
+        part, other = max(parts, key=lambda found: len(found[0].looks))
+        record[family.name], errors[family.name] = part.looks, part.error
+        roots.append(other.root)
+        if other.root != mine.name:
+            of = "" if part.of == 1 else f", of whose {part.of} pairs it is a part"
+            is_spent = part.error - sum(look.error for look in part.looks) < 1e-9
+            left = "; to look further, allow a larger error=" if is_spent and _open(part.looks[-1]) else ""
+            lines.append(f"By {family.name}, this continues the looks of {other.name}{of}{left}.")
     root = roots[0] if len({*roots}) == 1 else mine.name
-    sizes = {look.size for looks in record.values() for look in looks}  # and those that it will look at
+    sizes = _sizes(record)  # and those that it will look at
     sizes |= {size for family in asked for size in family.plan.looks if size > max(sizes, default=0)}
     told: dict[str, float] = {}  # error spent, by account
+    groups = {*mine.identities.values()}
     for other in others:
-        is_mine = other.root == root and other.sizes <= sizes
-        common = {*other.identities.values()} & {*mine.identities.values()}
-        if other.spent and not is_mine and (mine.shares_runs(other) or len(common) > 1):
+        is_mine = other.root == root and _sizes(other.record) <= sizes
+        is_near = mine.shares_runs(other) or len({*other.identities.values()} & groups) > 1
+        if other.spent and is_near and not is_mine:
             told[other.root] = max(told.get(other.root, 0.0), other.spent)
     if told:
         questions = "1 other question" if len(told) == 1 else f"{len(told)} other questions"
@@ -176,7 +167,6 @@ def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], 
         lines.append(
             f"These runs have been asked {questions}, which spent {spent}; the error of this one is on top of it."
         )
-    groups = {*mine.identities.values()}
     same = [other for other in others if {*other.identities.values()} == groups and mine.shares_runs(other)]
     if gone := sorted({*mine.compared}.union(*(other.compared for other in same)) - {*runs}):
         lines.append(
@@ -200,16 +190,16 @@ def _read(folder: RunFolder) -> Asked:
     return replace(_ASKED.validate_python(folder.config), name=folder.name)
 
 
-def _source(family: Family, asked: Sequence[Family], mine: Asked, other: Asked) -> str:
-    """Return the name of another question's family that compares the same; empty if none is known to."""
-    if family is asked[-1]:  # all groups
-        return [*other.record][-1]
-    same = mine.by == other.by and mine.identities == other.identities
-    return family.name if same and family.name in other.record else ""
+def _sizes(record: Mapping[str, Sequence[Look]]) -> set[int]:
+    return {look.size for looks in record.values() for look in looks}
 
 
-@dataclass(frozen=True)
-class _Part:
+def _open(look: Look) -> int:
+    """Return how many pairs a look left open."""
+    return sum(verdict.said == "not decided" for verdict in look.verdicts)
+
+
+class _Part(NamedTuple):
     """The looks of another question at a family's pairs."""
 
     looks: list[Look]
@@ -219,18 +209,27 @@ class _Part:
 
 def _part(family: Family, asked: Sequence[Family], mine: Asked, other: Asked) -> _Part | None:
     """Return another question's looks at all pairs of a family; None if there are none that it may continue."""
-    source = _source(family, asked, mine, other) if other.record else ""
-    if not (whole := other.record.get(source)) or mine.measure != other.measure or not mine.shares_runs(other):
+    if not other.record or mine.measure != other.measure or not mine.shares_runs(other):
         return None
-    labels = {name: name for name in family.seeds}
-    if family is asked[-1]:
-        own = {identity: label for label, identity in mine.identities.items()}
+    if family is asked[-1]:  # all groups
+        source, own = [*other.record][-1], {identity: label for label, identity in mine.identities.items()}
         labels = {label: own[identity] for label, identity in other.identities.items() if identity in own}
+    elif mine.by == other.by and mine.identities == other.identities:
+        source, labels = family.name, {name: name for name in family.seeds}
+    else:
+        return None
+    if not (whole := other.record.get(source)):
+        return None
     pairs, every = family.plan.pairs(family.seeds), len(whole[0].verdicts)
     looks: list[Look] = []
     for look in whole:
-        renamed = [_renamed(verdict, labels, pairs) for verdict in look.verdicts]
-        verdicts = [verdict for verdict in renamed if verdict is not None]
+        renamed = [
+            replace(each, group=labels[each.group], other=labels[each.other])
+            for each in look.verdicts
+            if {each.group, each.other} <= labels.keys()
+        ]
+        ordered = [each if (each.group, each.other) in pairs else each.turned for each in renamed]
+        verdicts = [each for each in ordered if (each.group, each.other) in pairs]
         if not looks and len(verdicts) < len(pairs):
             return None
         if verdicts:
@@ -245,28 +244,8 @@ def _part(family: Family, asked: Sequence[Family], mine: Asked, other: Asked) ->
     if left < -1e-9:
         return None
     # As at the other question's next look, its open pairs share what is left; with delta all of its pairs do.
-    still, of_all = (sum(verdict.said == "not decided" for verdict in each[-1].verdicts) for each in (looks, whole))
-    share = len(pairs) / every if mine.delta is not None or every == len(pairs) else still / max(of_all, 1)
+    share = len(pairs) / every
+    if mine.delta is None and every > len(pairs):
+        share = _open(looks[-1]) / max(_open(whole[-1]), 1)
     error = sum(look.error for look in looks) + share * max(left, 0.0)
     return _Part(looks, error, every if every > len(pairs) else 1)
-
-
-def _renamed(verdict: Verdict, labels: Mapping[str, str], pairs: Sequence[tuple[str, str]]) -> Verdict | None:
-    """Return a verdict of another question in this one's names and order; None if it is about another pair."""
-    pair = labels.get(verdict.group, ""), labels.get(verdict.other, "")
-    if pair in pairs:
-        return replace(verdict, group=pair[0], other=pair[1])
-    if pair[::-1] not in pairs:
-        return None
-    said: Literal["better", "worse", "equivalent", "not decided"] = verdict.said
-    if verdict.said in ("better", "worse"):
-        said = "worse" if verdict.said == "better" else "better"
-    return replace(
-        verdict,
-        group=pair[1],
-        other=pair[0],
-        said=said,
-        difference=-verdict.difference,
-        low=-verdict.high,
-        high=-verdict.low,
-    )

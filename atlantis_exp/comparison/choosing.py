@@ -38,8 +38,7 @@ def select(runs: Iterable[R], where: Sequence[str]) -> list[R]:
 def is_where(run: Run, where: Sequence[str]) -> bool:
     """Return whether all of KEY=VALUE hold for a run."""
     facts = run.facts
-    pairs = (text.split("=", 1) for text in where)
-    return all(_is(facts.get(resolve(key, facts)), value) for key, value in pairs)
+    return all(_is(facts.get(resolve(key, facts)), value) for key, _, value in (text.partition("=") for text in where))
 
 
 def group(runs: Iterable[R], by: Sequence[str]) -> dict[str, list[R]]:
@@ -92,31 +91,30 @@ def mixed_protocol(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) 
     """
     games = {name: title_of(config["env.id"]) for name, config in configs.items()}
     if len(set(games.values())) > 1:
-        return "game", f"env.id differs: scores of different games are not compared: {_holders(games)}"
+        return "game", f"env.id differs: scores of different games are not compared: {holders(games)}"
     asked = {resolve(key, config) for key in by for config in configs.values()}
     for key in PROTOCOL:
         values = {name: json.dumps(config[key]) for name, config in configs.items()}
         if key not in asked and len(set(values.values())) > 1:
-            return key, f"{key} differs, so the scores do not mean the same: {_holders(values)}"
+            return key, f"{key} differs, so the scores do not mean the same: {holders(values)}"
     return None
 
 
 def refuse_mixed_protocols(trainings: Sequence[Training], by: Sequence[str]) -> None:
     """Raise ConfigError if trainings differ in their protocol, other than in keys of `by`."""
-    if (mixed := mixed_protocol({training.name: training.config for training in trainings}, by)) is None:
-        return
-    key, sentence = mixed
-    hints = {
-        "game": "choose with runs= or where=env.id=ID",
-        "evaluation.epsilon": (
-            "at_epsilon=VALUE takes evaluations at that one, `evaluate run=NAME epsilon=VALUE` makes them"
-        ),
-    }
-    raise ConfigError(f"{sentence}; {hints.get(key, f'choose with runs= or where=, or ask for it with by={key}')}")
+    if mixed := mixed_protocol({training.name: training.config for training in trainings}, by):
+        key, sentence = mixed
+        hint = {
+            "game": "choose with runs= or where=env.id=ID",
+            "evaluation.epsilon": (
+                "at_epsilon=VALUE takes evaluations at that one, `evaluate run=NAME epsilon=VALUE` makes them"
+            ),
+        }.get(key, f"choose with runs= or where=, or ask for it with by={key}")
+        raise ConfigError(f"{sentence}; {hint}")
 
 
-def _holders(values: Mapping[str, str]) -> str:
-    """Say which names have which value."""
+def holders(values: Mapping[str, str]) -> str:
+    """Say which names have which value: the first of them, and how many more."""
     names = defaultdict(list)
     for name, value in values.items():
         names[value].append(name)
@@ -128,9 +126,7 @@ def _holders(values: Mapping[str, str]) -> str:
 
 def plays_alike(player: Player, trainings: Iterable[Training]) -> bool:
     """Return whether all play the same game; the crop belongs to a network, as epsilon does."""
-    keys = set(PROTOCOL) - {"env.crop"}
-    if "weights" not in player.config:
-        keys -= {"evaluation.epsilon"}
+    keys = {*PROTOCOL} - ({"env.crop"} if "weights" in player.config else {"env.crop", "evaluation.epsilon"})
     return all(player.config.get(key) == training.config[key] for training in trainings for key in keys)
 
 

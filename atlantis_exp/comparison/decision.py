@@ -1,22 +1,22 @@
-"""Which of several groups of seeds plays better: a test that may be looked at more than once.
+"""Decide which of several groups of seeds plays better, by a test that may be looked at more than once.
 
-A comparison has a `Plan`: at which numbers of seeds it looks, and the error that all its pairs and all its looks share.
-`decide` takes the look that is due and returns the verdicts with the record of looks, which is the input of the next
-call. Each look tests by Welch's t with the error that it may spend (Lan and DeMets 1983; quadratic in the number of
-seeds, Kim and DeMets 1987), divided among the pairs that are open (Holm 1979). Both divisions are Bonferroni's, so they
-hold for any number of looks and for pairs that share a group; not where the scores themselves say when to look, and not
-where groups of one mean differ in shape: `condition` tells how far a verdict is from that.
+A `Plan` says at which numbers of seeds to look, and which error all pairs and all looks share. `decide` takes the look
+that is due; the record of looks that it returns is the input of the next call. Each look tests by Welch's t with the
+error that it may spend (Lan and DeMets 1983; quadratic in the number of seeds, Kim and DeMets 1987), divided among the
+pairs that are open (Holm 1979). Both divisions are Bonferroni's, so they hold for any number of looks and for pairs
+that share a group. They do not hold if the scores say when to look, or if groups of one mean differ in shape:
+`condition` says how far a verdict is from that.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import nctdtr, stdtrit
 
+from atlantis_exp.documents import Said
 from atlantis_exp.statistics import probability_of_improvement
 
 Values = npt.NDArray[np.float64]
@@ -26,77 +26,64 @@ FEWEST_SEEDS = 5  # a group; with fewer nothing is decided
 
 
 def looks_up_to(seeds: int) -> tuple[int, ...]:
-    """The looks of a plan that ends at `seeds` a group, at each halving down to `FEWEST_SEEDS`: 20 gives 5, 10, 20."""
+    """Return the looks of a plan that ends at `seeds` a group: each halving down to five, so 20 gives 5, 10, 20."""
     return (*(looks_up_to(seeds // 2) if seeds // 2 >= FEWEST_SEEDS else ()), seeds)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """At which numbers of seeds a group a comparison looks, and what it may get wrong.
+    """At which numbers of seeds a group a comparison looks, and what it may get wrong."""
 
-    Raises:
-        ValueError: for looks that do not rise or begin below `FEWEST_SEEDS`, an error outside (0, 1), or a delta that
-            is not positive.
-    """
-
-    looks: tuple[int, ...] = looks_up_to(10)  # seeds a group
+    looks: tuple[int, ...] = looks_up_to(10)  # seeds a group, rising from `FEWEST_SEEDS` or more
     error: float = 0.05  # probability of any false verdict, over all pairs and all looks
     delta: float | None = None  # a difference below it does not matter; without it nothing is found equivalent
     relative: bool = False  # whether delta is a share of the baseline's mean, without a baseline of the pair's mean
     baseline: str | None = None  # the group that each other one is compared with, in place of all pairs
 
-    def __post_init__(self) -> None:
-        if not self.looks or self.looks[0] < FEWEST_SEEDS or any(np.diff(self.looks) <= 0):
-            raise ValueError(f"looks must rise from {FEWEST_SEEDS} seeds or more, not {self.looks}")
-        if not 0 < self.error < 1:
-            raise ValueError(f"error must lie between 0 and 1, not {self.error}")
-        if self.delta is not None and not 0 < self.delta < np.inf:
-            raise ValueError(f"delta must be positive, not {self.delta}")
-
     def pairs(self, groups: Collection[str]) -> list[Pair]:
-        """The pairs that are compared, by name: each group with the baseline, or each with each.
-
-        Raises:
-            ValueError: for fewer than two groups, or where the baseline is none of them.
-        """
-        if len(groups) < 2:
-            raise ValueError("a comparison needs at least two groups")
+        """Return the pairs that are compared, by name: each group with the baseline, or each with each."""
         if self.baseline is None:
             return list(combinations(sorted(groups), 2))
-        if self.baseline not in groups:
-            raise ValueError(f"the baseline {self.baseline} is none of the groups {', '.join(sorted(groups))}")
         return [(group, self.baseline) for group in sorted(groups) if group != self.baseline]
 
     def spendable(self, seeds: int) -> float:
-        """The error that may be spent by a look at so many seeds: error (seeds / last look)^2, at most the error."""
+        """Return the error that looks up to so many seeds may spend: error x (seeds / last look)^2."""
         return self.error * min(1.0, seeds / self.looks[-1]) ** 2
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What one look said of the mean over one group's seeds less that over another's.
+    """What one look said of the mean over one group's seeds less that over another's; NaN before the first look.
 
-    The interval is the one that the verdict rests on: it leaves out zero or lies within delta just where that was
-    found, and covers with at least 1 - the plan's error whenever the looks stop, for groups that differ in their mean
-    only. NaN before the first look.
+    The verdict rests on the interval: it leaves out zero, or lies within delta, exactly if that was found. It covers
+    with at least 1 - the plan's error whenever the looks stop, for groups that differ in their mean only.
     """
 
     group: str
     other: str
-    said: Literal["better", "worse", "equivalent", "not decided"] = "not decided"  # of the group, against the other
+    said: Said = "not decided"  # of the group, against the other
     difference: float = np.nan
     low: float = np.nan
     high: float = np.nan
     seeds: int = 0  # of each of the two groups, that it rests on
     detectable: float | None = None  # the difference found with 80 % at these spreads; after the last look, undecided
 
+    @property
+    def turned(self) -> "Verdict":
+        """The same of the other group, against this one."""
+        said: Said = {"better": "worse", "worse": "better"}.get(self.said, self.said)  # type: ignore[assignment]
+        of = {"group": self.other, "other": self.group, "difference": -self.difference}
+        return replace(self, said=said, low=-self.high, high=-self.low, **of)  # type: ignore[arg-type]
+
+    @property
+    def leading(self) -> "Verdict":
+        """It, seen from the group with the higher mean."""
+        return self if self.difference > 0 else self.turned
+
 
 @dataclass(frozen=True)
 class Look:
-    """One look that was taken, and all that the next one must know of it.
-
-    It holds nothing but numbers, strings, lists and dicts: `dataclasses.asdict` gives JSON.
-    """
+    """One look that was taken, and all that the next one must know of it; `dataclasses.asdict` gives JSON."""
 
     seeds: dict[str, list[int]]  # of each group that was looked at
     error: float  # spent by this look
@@ -110,7 +97,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Decision:
-    """Where a comparison stands: a verdict for each pair, the looks taken, and when the next one is due."""
+    """A verdict for each pair, the looks taken, and when the next one is due."""
 
     verdicts: list[Verdict]
     looks: list[Look]
@@ -118,7 +105,7 @@ class Decision:
 
     @property
     def contenders(self) -> list[str]:
-        """The groups in a pair that is not decided: those that need seeds, as long as there is a next look."""
+        """The groups in open pairs, which need seeds as long as there is a next look."""
         return _names((verdict.group, verdict.other) for verdict in self.verdicts if verdict.said == "not decided")
 
     @property
@@ -133,29 +120,21 @@ def decide(
     """Take the look that is due, if one is, and say what is decided.
 
     A look is due when all contenders have the seeds of a planned one that has not been taken, or with `now` at any
-    number of seeds from `FEWEST_SEEDS`. It takes the first n seeds of each contender in the order of the seeds, n being
-    what all of them have and at most the plan's last look, and spends what may be spent by n less what is spent. So
-    a look at the same n costs nothing and finds nothing, and looks nobody planned leave less for those to come. What is
-    decided stays decided.
+    number of seeds from `FEWEST_SEEDS`. It takes the first n seeds of each contender by number, n being what all of
+    them have and at most the plan's last look, and spends what may be spent by n less what is spent. So a look at the
+    same n costs nothing and finds nothing, and an unplanned look leaves less for those to come. What is decided stays
+    decided.
 
-    Where any contender's seeds fall into modes, no group's variance counts for less than the contenders' average: a
-    group all of whose few seeds happen to have survived is not known to be steady. Where no seed of a pair differs from
-    its group's, the difference itself stands for their unknown spread.
+    If any contender's seeds fall into modes, no group's variance counts for less than the contenders' average: a group
+    whose few seeds all survived is not known to be steady. If no seed of a pair differs from its group's, the
+    difference itself stands for their unknown spread.
 
     Args:
         groups: one value a seed, by group and seed.
-        looks: the record of the looks taken, in order.
-
-    Raises:
-        ValueError: for a value that is not finite, for what `Plan.pairs` raises, and for a record of other pairs.
+        looks: the record of the looks taken at the plan's pairs, in order.
     """
-    pairs = plan.pairs(groups)
-    if not np.isfinite([value for values in groups.values() for value in values.values()]).all():
-        raise ValueError("a decision needs finite values")
+    pairs, looks = plan.pairs(groups), list(looks)
     verdicts = {pair: Verdict(*pair) for pair in pairs}
-    if looks and {(verdict.group, verdict.other) for verdict in looks[0].verdicts} != set(pairs):
-        raise ValueError("the looks taken were at other pairs of groups")
-    looks = list(looks)
     verdicts |= {(verdict.group, verdict.other): verdict for look in looks for verdict in look.verdicts}
     undecided = [pair for pair in pairs if verdicts[pair].said == "not decided"]
     if undecided:
@@ -182,11 +161,11 @@ class Modes:
 
 
 def modes(values: npt.ArrayLike) -> Modes | None:
-    """The two modes of at least three values, one a seed, or None where they look like one.
+    """Return the two modes of values, one a seed; None if they look like one mode or are fewer than three.
 
-    There are two where the largest gap between neighbours exceeds t(0.9975, n - 2) times the standard deviation within
-    the two parts that it separates: 7.5 times at five seeds, 3.8 times at ten. Of normal values 2 to 5 % seem to be two
-    modes by chance, and of three values no more than the equal ones are told apart.
+    There are two if the largest gap between neighbours exceeds t(0.9975, n - 2) times the standard deviation within
+    the two parts that it separates: 7.5 times at five seeds, 3.8 times at ten. Normal values seem to be two modes in
+    2 to 5 % of cases.
     """
     ordered = np.sort(np.asarray(values, np.float64))
     if ordered.size < 3:
@@ -200,22 +179,10 @@ def modes(values: npt.ArrayLike) -> Modes | None:
     return Modes(upper.size / ordered.size, float(upper.mean()), float(lower.mean()))
 
 
-def equal_scores(scores: Mapping[str, Sequence[float]]) -> list[list[str]]:
-    """The names whose lists of episode scores are equal, in sets of two or more.
-
-    Names are those of seeds or runs; the lists are in the order of the episodes.
-    """
-    names: dict[tuple[float, ...], list[str]] = {}
-    for name, values in scores.items():
-        names.setdefault(tuple(values), []).append(name)
-    return [alike for alike in names.values() if len(alike) > 1]
-
-
 def mean_interval(values: npt.ArrayLike, level: float = 0.95) -> tuple[float, float]:
-    """Student's interval of the mean over seeds, one value a seed; NaN for fewer than two.
+    """Return Student's interval of the mean over seeds, one value a seed; NaN for fewer than two.
 
-    It covers what it says for normal values. For bimodal ones (70:30) its 95 % are 72 at three seeds, 83 at five and 94
-    at ten, for log-normal ones 82 to 84: `python -m benchmarks.decisions`.
+    `python -m benchmarks.decisions` shows what it covers of values that are not normal.
     """
     seeds = np.asarray(values, np.float64)
     if seeds.size < 2:
@@ -225,7 +192,7 @@ def mean_interval(values: npt.ArrayLike, level: float = 0.95) -> tuple[float, fl
 
 
 def detectable(plan: Plan, spread: float, pairs: int = 1) -> float:
-    """The least difference that the plan's last look finds with 80 %, in the units of `spread`.
+    """Return the least difference that the plan's last look finds with 80 %, in the units of `spread`.
 
     Args:
         spread: standard deviation over seeds of each of the two groups.
@@ -235,19 +202,19 @@ def detectable(plan: Plan, spread: float, pairs: int = 1) -> float:
 
 
 def equivalence(plan: Plan, spread: float, pairs: int = 1) -> float:
-    """The least delta within which the plan's last look finds two groups of one mean equivalent with 80 %.
+    """Return the least delta within which the last look finds two groups of one mean equivalent with 80 %.
 
-    In the units of `spread`; arguments as for `detectable`.
+    Units and arguments as for `detectable`.
     """
     freedom, error = 2 * (plan.looks[-1] - 1), _errors(plan)[-1] / pairs
     return float((-stdtrit(freedom, error / 2) + stdtrit(freedom, 0.9)) * np.sqrt(2 / plan.looks[-1]) * spread)
 
 
 def power(plan: Plan, difference: float, spread: float, pairs: int = 1) -> tuple[float, float]:
-    """The probability that the plan finds a difference, and the mean number of seeds a group that it takes.
+    """Return the probability that the plan finds a difference, and the mean number of seeds a group that it takes.
 
-    Both by the noncentral t of each look alone, as if what one look finds every later one found too: a little less
-    power and more seeds than there will be. Arguments as for `detectable`.
+    Both are by the noncentral t of each look alone, as if later looks found all that an earlier one finds: a little
+    less power and more seeds than there will be. Arguments as for `detectable`.
     """
     looks = np.array(plan.looks)
     freedom = 2 * (looks - 1)
@@ -266,11 +233,6 @@ class Condition:
     undone_by: float  # share of the better group's seeds that would undo the verdict if they scored the floor
     unseen: float  # share of such seeds that would still escape a look of this size in one of twenty cases
 
-    @property
-    def is_strained(self) -> bool:
-        """Return whether an unseen collapse could undo the verdict, or one spread is twice the other."""
-        return self.undone_by < self.unseen or self.spreads > 2
-
 
 def condition(verdict: Verdict, look: Look, groups: Mapping[str, Mapping[int, float]]) -> Condition:
     """Return the condition of a verdict of "better" or "worse".
@@ -286,10 +248,9 @@ def condition(verdict: Verdict, look: Look, groups: Mapping[str, Mapping[int, fl
 
 
 def size_found(verdict: Verdict, look: Look) -> float:
-    """Return a decided difference, corrected for that a smaller one would not have been decided.
+    """Return a decided difference, corrected for the look's finding large ones first (Zhong and Prentice 2008).
 
-    As many true differences lie above it as below, among those decided at this look (Zhong and Prentice 2008, by the
-    noncentral t). The plain difference overstates: at five seeds a true one of 1 sd is found as 1.9 sd on average.
+    Among the differences decided at this look, as many true ones lie above it as below, by the noncentral t.
     """
     freedom = 2 * (verdict.seeds - 1)
     limit = -stdtrit(freedom, look.error / len(look.verdicts) / 2)
@@ -307,24 +268,14 @@ def size_found(verdict: Verdict, look: Look) -> float:
 def may_be_best(decision: Decision) -> list[str]:
     """Return the groups that no other was found better than.
 
-    With at least 1 - the plan's error the best is among them, if each was compared with each.
+    With at least 1 - the plan's error they include the best, if each was compared with each.
     """
     beaten = {
         verdict.group if verdict.said == "worse" else verdict.other
         for verdict in decision.verdicts
         if verdict.said in ("better", "worse")
     }
-    return [
-        name for name in _names((verdict.group, verdict.other) for verdict in decision.verdicts) if name not in beaten
-    ]
-
-
-def no_worse(verdict: Verdict, margin: float) -> bool:
-    """Return whether the group is no worse than the other by more than a margin, as far as the interval says so.
-
-    For one pair this is wrong with at most half the plan's error. It takes no further look and spends nothing.
-    """
-    return verdict.low > -margin
+    return sorted(set(_names((verdict.group, verdict.other) for verdict in decision.verdicts)) - beaten)
 
 
 def seeds_needed(difference: float, spread: float, error: float = 0.05, pairs: int = 1) -> int | None:
@@ -334,10 +285,9 @@ def seeds_needed(difference: float, spread: float, error: float = 0.05, pairs: i
 
 
 def improvement(one: npt.ArrayLike, other: npt.ArrayLike) -> tuple[float, float, float]:
-    """Return the probability that a seed of one group beats one of another, with the 95 % interval around it.
+    """Return the probability that a seed of one group beats one of another, between the ends of its 95 % interval.
 
-    The interval is Newcombe's (2006, method 5), which holds where all seeds of one group are above the other's.
-    Returned are its low end, the probability and its high end.
+    The interval is Newcombe's (2006, method 5), which also holds if all seeds of one group are above the other's.
     """
     seeds, others = np.asarray(one, np.float64), np.asarray(other, np.float64)
     found, half = probability_of_improvement(seeds, others), (seeds.size + others.size) / 2 - 1
@@ -361,19 +311,19 @@ def _falls_to(zero: Callable[[float], float], low: float, high: float) -> float:
 
 
 def _errors(plan: Plan) -> Values:
-    """What each planned look spends."""
+    """Return what each planned look spends."""
     return np.diff([0.0, *map(plan.spendable, plan.looks)])
 
 
 def _detectable(error: float, size: int, spread: Values | float) -> Values:
-    """The difference of two groups' means that Welch's test finds with 80 %; the sum of two quantiles of t."""
+    """Return the difference that Welch's test finds with 80 %, the sum of two quantiles of t."""
     freedom = 2 * (size - 1)
     reach = (-stdtrit(freedom, error / 2) + stdtrit(freedom, 0.8)) * np.sqrt(2 / size)
     return np.asarray(reach * spread, np.float64)
 
 
 def _left(plan: Plan, size: int, looks: Sequence[Look]) -> float:
-    """The error that a look at `size` seeds may spend: none where it is not later than those taken."""
+    """Return the error that a look at `size` seeds may spend: none if it is not later than those taken."""
     if looks and size <= looks[-1].size:
         return 0.0
     left = plan.spendable(size) - sum(look.error for look in looks)

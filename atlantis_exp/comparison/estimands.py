@@ -48,8 +48,7 @@ def training_score(episodes: TrainingEpisodes, steps: int, num_envs: int, window
 
     The ratio is what renewal theory gives for the mean (Smith 1958). The mean over the episodes that ended in the
     window is too low while a network learns, since an episode that ends has begun with an earlier one. An episode that
-    began before the window counts with the points of its steps within it; episodes that are not over at its end have
-    the points a step of the others.
+    began before the window counts with its steps within it, and open episodes with the points a step of the others.
 
     Args:
         steps: of the whole training, of all environments together.

@@ -1,8 +1,8 @@
-"""Draw the tables of a comparison; a group has a colour and a line style, so that either tells it."""
+"""Draw the tables of a comparison; a group has its own colour and line style."""
 
 import io
 import re
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 _COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 _LINES = ("-", "--", "-.", ":")
 _HEIGHT = 3.2  # inches
-_FEW = 30  # episodes of a group, below which a histogram of 30 bins shows holes, not a shape
 _GREY = "#6e7781"  # of what is averaged over several groups
 _INK = "#24292f"  # of text and axes; a page lets it follow its own
 _STYLE = {
@@ -56,7 +55,8 @@ class Drawn:
 
 def draw(comparison: Comparison) -> dict[str, Drawn]:
     """Draw all figures of a comparison, by name; one without data is left out."""
-    tables, groups, drawn = comparison.tables, comparison.groups, dict[str, Drawn]()
+    tables, groups, game = comparison.tables, comparison.groups, comparison.game
+    drawn = dict[str, Drawn]()
 
     def add(name: str, plot: Callable[..., None], title: str, alt: str, height: float = _HEIGHT, **of: Any) -> None:
         drawn[name] = _render(partial(plot, comparison=comparison, **of), title, alt, height)
@@ -77,14 +77,14 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
                     + _said(groups, rows, "epsilon", ".3f"),
                     rows=rows,
                 )
-    scores, row_height = tables["scores"], 1.2 + 0.45 * len(groups)
+    scores = tables["scores"]
     add(
         *("scores", _scores, "Scores"),
         "One dot a seed, the score as a diamond, with its 95 % interval from five seeds on; scores: "
         + _said([row["group"] for row in scores], scores, "score"),
         1.2 + 0.45 * len(scores),
     )
-    if comparison.game.sources:
+    if game.sources:
         add(
             *("why", _why, "Rate and survival"),
             "Points per 1,000 emulator frames, split by what paid them, and at each bar the mean frames of an episode; "
@@ -93,13 +93,11 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
         )
     if not tables["evaluation"]:
         return drawn
-    medians = f"; medians: {_said(groups, tables['evaluation'], 'median')}"
-    if any(row["episodes"] < _FEW for row in tables["evaluation"]):
-        distribution = (_strips, "One dot an evaluated episode", row_height)
-    else:
-        distribution = (_distribution, "Histogram of evaluated scores, one step line a group", _HEIGHT)
-    plot, alt, height = distribution
-    add("distribution", plot, "Distribution of the evaluated scores", alt + medians, height)
+    add(
+        *("distribution", _distribution, "Distribution of the evaluated scores"),
+        "Histogram of evaluated scores, one step line a group; medians: "
+        + _said(groups, tables["evaluation"], "median"),
+    )
     add(
         *("profile", _profile, "Share of episodes above a score"),
         "Performance profile: for each score the share of a group's episodes that exceed it.",
@@ -115,7 +113,7 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
         add(
             *("references", _references, "Against other players"),
             "Mean scores of the groups among measured players and published algorithms"
-            + (", on a logarithmic axis." if comparison.game.is_logarithmic else "."),
+            + (", on a logarithmic axis." if game.is_logarithmic else "."),
             1.0 + 0.24 * (len(groups) + len(tables["references"])),
         )
     return drawn
@@ -162,15 +160,20 @@ def _said(groups: Sequence[str], rows: Table, column: str, style: str = ",.0f") 
     return ", ".join(f"{group} {last[group]:{style}}" for group in groups if group in last)
 
 
-def _look(groups: Sequence[str], group: str) -> dict[str, Any]:
-    index = groups.index(group)
+def _look(comparison: Comparison, group: str) -> dict[str, Any]:
+    index = comparison.groups.index(group)
     return {"color": _COLOURS[index % len(_COLOURS)], "linestyle": _LINES[index % len(_LINES)]}
 
 
 def _columns(rows: Table, group: str, *keys: str) -> list[list[float]]:
     """Return columns of a group's rows."""
-    own = [row for row in rows if row["group"] == group]
-    return [[row[key] for row in own] for key in keys]
+    return [[row[key] for row in rows if row["group"] == group] for key in keys]
+
+
+def _lines(axes: "Axes", comparison: Comparison, rows: Table, x: str, y: str) -> None:
+    """Draw a line for each group."""
+    for group in comparison.groups:
+        axes.plot(*_columns(rows, group, x, y), label=group, **_look(comparison, group))
 
 
 def thousands(axis: Any) -> None:
@@ -196,14 +199,19 @@ def _rows(axes: "Axes", names: Sequence[str], above: float = 0.8) -> None:
     axes.set_ylim(len(names) - 0.4, -above)
 
 
-def _legend(axes: "Axes", columns: int = 2) -> None:
-    """Put a legend above the axes, in as many columns as fit, and make the figure higher by that."""
-    if not axes.get_legend_handles_labels()[0]:
-        return
+def _finish(axes: "Axes", x: str, y: str = "", *, is_logarithmic: bool = False, columns: int = 2) -> None:
+    """Label the axes, and put a legend above them, in as many columns as fit, for which the figure grows."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+    if is_logarithmic:
+        axes.set_xscale("log")
+    axes.set_xlabel(f"{x} (logarithmic)" if is_logarithmic else x)
+    axes.set_ylabel(y)
+    if x != _UNITS["hours"]:  # half an hour is not 500m
+        thousands(axes.xaxis)
     figure = axes.get_figure(root=True)
-    assert figure is not None
+    if figure is None or not axes.get_legend_handles_labels()[0]:
+        return
     renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
     for number in range(columns, 0, -1):
         legend = figure.legend(loc="outside upper left", ncols=number, fontsize=7.5, columnspacing=1)
@@ -231,11 +239,11 @@ def _learning(axes: "Axes", comparison: Comparison, axis: str, rows: Table) -> N
     seeds = [row for row in comparison.tables["seed_curves"] if row["axis"] == axis]
     ends = {row["group"]: row["score"] for row in rows}
     leading = sorted(ends, key=lambda group: -ends[group])[:2]  # more bands over each other show nothing
+    _lines(axes, comparison, rows, "x", "score")
     for group in comparison.groups:
-        x, score, low, high = _columns(rows, group, "x", "score", "low", "high")
-        look = _look(comparison.groups, group)
-        axes.plot(x, score, label=group, **look)
+        look = _look(comparison, group)
         if group in leading:
+            x, low, high = _columns(rows, group, "x", "low", "high")
             axes.fill_between(x, low, high, color=look["color"], alpha=0.2, linewidth=0)
         for run in dict.fromkeys(row["run"] for row in seeds if row["group"] == group):
             points = [(row["x"], row["score"]) for row in seeds if row["run"] == run]
@@ -245,13 +253,9 @@ def _learning(axes: "Axes", comparison: Comparison, axis: str, rows: Table) -> N
     axes.set_ylim(0 if min(scores) >= 0 else None, None)
     if axis == "frames":
         _published(axes, comparison.tables["published_curves"])
-    axes.set_xlabel(_UNITS[axis])
-    axes.set_ylabel("training score, mean of 100")
     axes.locator_params(axis="x", nbins=5)
-    if axis != "hours":
-        thousands(axes.xaxis)
     thousands(axes.yaxis)
-    _legend(axes)
+    _finish(axes, _UNITS[axis], "training score, mean of 100")
 
 
 def _published(axes: "Axes", rows: Table) -> None:
@@ -268,26 +272,24 @@ def _published(axes: "Axes", rows: Table) -> None:
 
 
 def _exploration(axes: "Axes", comparison: Comparison, rows: Table) -> None:
-    for group in comparison.groups:
-        axes.plot(*_columns(rows, group, "x", "epsilon"), label=group, **_look(comparison.groups, group))
+    _lines(axes, comparison, rows, "x", "epsilon")
     axes.set_ylim(0, 1)
-    axes.set_xlabel(_UNITS["frames"])
-    axes.set_ylabel("epsilon")
     axes.locator_params(axis="x", nbins=5)
-    thousands(axes.xaxis)
-    _legend(axes)
+    _finish(axes, _UNITS["frames"], "epsilon")
 
 
 def _scores(axes: "Axes", comparison: Comparison) -> None:
     table = comparison.tables["scores"]
     for y, row in enumerate(table):
         group = row["group"]
-        colour = _look(comparison.groups, group)["color"] if group in comparison.groups else _GREY
+        colour = _look(comparison, group)["color"] if group in comparison.groups else _GREY
         of_row = [
-            seed for seed in comparison.tables["seeds"] if (seed["family"], seed["group"]) == (row["family"], group)
+            seed["score"]
+            for seed in comparison.tables["seeds"]
+            if (seed["family"], seed["group"]) == (row["family"], group)
         ]
         axes.plot([row["low"], row["high"]], [y, y], color=colour, linewidth=3, alpha=0.45, solid_capstyle="butt")
-        axes.plot([seed["score"] for seed in of_row], [y] * len(of_row), "o", color=colour, markersize=4, alpha=0.5)
+        axes.plot(of_row, [y] * len(of_row), "o", color=colour, markersize=4, alpha=0.5)
         axes.plot(row["score"], y, "D", color=colour, markersize=6)
         axes.annotate(
             f"{row['score']:,.0f}", (row["score"], y), (0, 6), textcoords="offset points", ha="center", fontsize=8
@@ -296,9 +298,7 @@ def _scores(axes: "Axes", comparison: Comparison) -> None:
     _reference_lines(axes.axvline, comparison, min(ends), max(ends))
     axes.margins(x=0.1)
     _rows(axes, [row["group"] for row in table])
-    axes.set_xlabel("score, one dot a seed")
-    thousands(axes.xaxis)
-    _legend(axes)
+    _finish(axes, "score, one dot a seed")
 
 
 def _why(axes: "Axes", comparison: Comparison) -> None:
@@ -318,9 +318,7 @@ def _why(axes: "Axes", comparison: Comparison) -> None:
     if min(rates) >= 0:
         axes.set_xlim(0, 1.45 * max(rates) or 1)
     _rows(axes, [row["group"] for row in rows], 0.6)
-    axes.set_xlabel("points per 1,000 frames")
-    thousands(axes.xaxis)
-    _legend(axes)
+    _finish(axes, "points per 1,000 frames")
 
 
 def _distribution(axes: "Axes", comparison: Comparison) -> None:
@@ -329,39 +327,16 @@ def _distribution(axes: "Axes", comparison: Comparison) -> None:
     edges = np.linspace(min(0.0, *everything), max(1.0, *everything), 31).tolist()  # 30 bins, as in report figure 3.1
     for group in comparison.groups:
         (scores,) = _columns(episodes, group, "score")
-        look = {"weights": [1 / len(scores)] * len(scores), **_look(comparison.groups, group)}
+        look = {"weights": [1 / len(scores)] * len(scores), **_look(comparison, group)}
         axes.hist(scores, edges, histtype="stepfilled", alpha=0.15, **look)
         axes.hist(scores, edges, histtype="step", label=group, **look)
-    axes.set_xlabel("score")
-    axes.set_ylabel("share of episodes")
-    thousands(axes.xaxis)
-    _legend(axes)
-
-
-def _strips(axes: "Axes", comparison: Comparison) -> None:
-    """Draw a row of dots for each group; equal scores are piled up."""
-    piles = Counter((row["group"], row["score"]) for row in comparison.tables["episodes"])
-    gap = min(0.08, 0.6 / max(piles.values()))
-    for (group, score), size in piles.items():
-        heights = comparison.groups.index(group) - gap * np.arange(size)
-        colour = _look(comparison.groups, group)["color"]
-        axes.plot(np.full(size, score), heights, "o", color=colour, markersize=5, alpha=0.6)
-    _rows(axes, comparison.groups)
-    axes.set_xlabel("score, one dot an episode")
-    thousands(axes.xaxis)
+    _finish(axes, "score", "share of episodes")
 
 
 def _profile(axes: "Axes", comparison: Comparison) -> None:
-    for group in comparison.groups:
-        points = _columns(comparison.tables["profile"], group, "tau", "share")
-        axes.plot(*points, label=group, **_look(comparison.groups, group))
-    is_logarithmic = comparison.game.is_logarithmic
-    axes.set_xscale("log" if is_logarithmic else "linear")
-    thousands(axes.xaxis)
-    axes.set_xlabel(f"score{' (logarithmic)' if is_logarithmic else ''}")
-    axes.set_ylabel("share of episodes above")
+    _lines(axes, comparison, comparison.tables["profile"], "tau", "share")
     axes.set_ylim(0, 1.03)
-    _legend(axes)
+    _finish(axes, "score", "share of episodes above", is_logarithmic=comparison.game.is_logarithmic)
 
 
 def _actions(axes: "Axes", comparison: Comparison) -> None:
@@ -375,9 +350,8 @@ def _actions(axes: "Axes", comparison: Comparison) -> None:
             left += row["network"] + row["random"]
     _rows(axes, comparison.groups, 0.6)
     axes.set_xlim(0, 1)
+    _finish(axes, "share of steps (hatched: by chance)", columns=4)
     axes.xaxis.set_major_formatter("{x:.0%}")
-    axes.set_xlabel("share of steps (hatched: by chance)")
-    _legend(axes, columns=4)
 
 
 def _references(axes: "Axes", comparison: Comparison) -> None:
@@ -386,18 +360,14 @@ def _references(axes: "Axes", comparison: Comparison) -> None:
         for row in comparison.tables["references"]
     ]
     bars += [
-        (row["group"], row["mean"], _look(comparison.groups, row["group"])["color"])
-        for row in comparison.tables["evaluation"]
+        (row["group"], row["mean"], _look(comparison, row["group"])["color"]) for row in comparison.tables["evaluation"]
     ]
     bars.sort(key=lambda bar: bar[1])
     names, scores, colours = zip(*bars, strict=True)
     axes.barh(range(len(bars)), scores, 0.7, color=colours)
-    is_logarithmic = comparison.game.is_logarithmic
-    axes.set_xscale("log" if is_logarithmic else "linear")
     axes.set_yticks(range(len(bars)), names, fontsize=8)
     axes.set_ylim(-0.6, len(bars) - 0.4)
     for y, score in enumerate(scores):
         axes.annotate(f"{score:,.0f}", (score, y), (4, 0), textcoords="offset points", va="center", fontsize=7)
     axes.margins(x=0.12)
-    thousands(axes.xaxis)
-    axes.set_xlabel(f"mean score{' (logarithmic)' if is_logarithmic else ''}")
+    _finish(axes, "mean score", is_logarithmic=comparison.game.is_logarithmic)

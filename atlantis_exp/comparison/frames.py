@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from atlantis_exp.comparison.gather import (
     named_by,
     read_runs,
 )
+from atlantis_exp.comparison.published import Row
 from atlantis_exp.components import facts_of, known
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.episodes import EpisodeTable
@@ -31,8 +32,6 @@ from atlantis_exp.statistics import summarize
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Row = dict[str, Any]
 
 _TAGS_LEFT_OUT = ("mlflow.", "atlantis.", "group")  # beginnings of tags that are columns of their own
 _RUN = ("run", "title", "kind", "group", "state", "error", "started", "updated", "score")
@@ -69,8 +68,7 @@ class Runs:
     skipped: dict[str, str]
 
 
-@dataclass(frozen=True)
-class _Frames:
+class _Frames(NamedTuple):
     """A run's part of each frame."""
 
     row: Row
@@ -173,12 +171,8 @@ def _read(run: StoredRun, points: int, skipped: dict[str, str]) -> _Frames:
                 raise
             skipped[f"evaluations/{each.folder.name}"] = f"broken: {error}"
             continue
-        place = {
-            "run": run.name,
-            "step": each.step,
-            "source": each.source,
-            "folder": f"{each.folder.path.parent.name}/{each.folder.name}",
-        }
+        place = {"run": run.name, "step": each.step, "source": each.source}
+        place["folder"] = f"{each.folder.path.parent.name}/{each.folder.name}"
         final = result is not None and each.step == result.steps
         evaluations.append({**place, "final": final, **_evaluation(each, table)})
         if final and run.trained:

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from math import isfinite, nan
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -201,8 +202,8 @@ def _open(folder: RunFolder, tree: dict[str, Any], later: Sequence[Evaluated]) -
 
 def _evaluations(outputs: Path, stored: Stored) -> dict[str, list[Evaluated]]:
     """Return the finished runs of the verb `evaluate` by the run they evaluate, by age; put exported weights aside."""
-    found: list[tuple[int, str, dict[str, Any], Evaluated]] = []
-    for path in (outputs / "evaluations").glob(f"*/{RESULT}"):
+    found: list[tuple[int, dict[str, Any], Evaluated]] = []
+    for path in sorted((outputs / "evaluations").glob(f"*/{RESULT}")):
         folder = RunFolder(path.parent)
         try:
             facts, commit = folder.config, folder.commit
@@ -212,18 +213,17 @@ def _evaluations(outputs: Path, stored: Stored) -> dict[str, list[Evaluated]]:
                 raise ValueError("its epsilon is not a number")
             step = int(facts["step"]) if "run" in facts else 0
             each = Evaluated(folder, EVALUATION, "evaluate", step, epsilon, facts["evaluation"].get("seed"))
-            found.append((commit.updated, folder.name, facts, each))
+            found.append((commit.updated, facts, each))
         except UNREADABLE as error:
             stored.skipped[f"evaluations/{folder.name}"] = _reason(error)
     trained: dict[str, list[Evaluated]] = defaultdict(list)
     exported: dict[tuple[str, float], StoredRun] = {}
-    for _, name, facts, each in sorted(found, key=lambda made: made[:2]):
+    for _, facts, each in sorted(found, key=itemgetter(0)):
         if "run" in facts:
             trained[str(facts["run"])].append(each)
         else:
-            exported[str(facts.get("sha256")), each.epsilon] = StoredRun(
-                name, flatten(facts), {}, each.folder, None, [each]
-            )
+            run = StoredRun(each.folder.name, flatten(facts), {}, each.folder, None, [each])
+            exported[str(facts.get("sha256")), each.epsilon] = run
     stored.exported = [*exported.values()]
     return trained
 
@@ -303,15 +303,9 @@ def _curve(folder: Path, tags: Mapping[str, str]) -> dict[str, Array]:
 
 def _episodes(evaluated: Evaluated, game: Game) -> EpisodeTable:
     """Read an evaluation's episodes, with the points of the game's sources. Raises: ValueError, OSError."""
-    path = evaluated.path
-    episodes = EpisodeTable.read(path, game.sources)
-    if not np.isfinite(episodes.scores).all():
-        raise ValueError(f"{path} has a score that is not a finite number")
-    others = (episodes.steps, episodes.frames, episodes.truncated, episodes.counts)
-    if not all(np.isfinite(each).all() for each in others):
-        raise ValueError(f"{path} has a count that is not a finite number")
+    episodes = EpisodeTable.read(evaluated.path, game.sources)
     if game.actions and episodes.actions != game.actions:
-        raise ValueError(f"{path} has other actions than the game")
+        raise ValueError(f"{evaluated.path} has other actions than the game")
     return episodes
 
 
@@ -322,8 +316,18 @@ def is_of_another(evaluation: RunFolder, run: RunFolder) -> bool:
 
 
 def named_by(outputs: Path, runs: Iterable[str]) -> list[str]:
-    """Return the names, starts of names and patterns of `runs`, a decision's name replaced by those of its runs."""
-    return [pattern for text in runs for pattern in _runs_of_decision(outputs, text) or [text]]
+    """Return the names, starts of names and patterns of `runs`, a decision's name replaced by those of its runs.
+
+    Raises:
+        Fault: if a decision's folder is damaged.
+    """
+    folders = {path.name: RunFolder(path) for path in (outputs / "decisions").glob("decide-*")}
+    patterns: list[str] = []
+    for text in runs:
+        of = folders[text].config.get("runs") if text in folders else None
+        names = [run for run in of if isinstance(run, str)] if isinstance(of, list) else []
+        patterns += names or [text]
+    return patterns
 
 
 def fits(name: str, patterns: Sequence[str]) -> bool:
@@ -331,12 +335,10 @@ def fits(name: str, patterns: Sequence[str]) -> bool:
 
     A pattern that ends with a seed is not the start of a longer one: `cnn-uniform-s1` does not match s10.
     """
-
-    def longer(pattern: str) -> str:
-        return "[!0-9]*" if re.search(r"s\d+$", pattern) else "*"
-
+    rests = ("[!0-9]*" if re.search(r"s\d+$", pattern) else "*" for pattern in patterns)
     return not patterns or any(
-        fnmatchcase(name, pattern) or fnmatchcase(name, pattern + longer(pattern)) for pattern in patterns
+        fnmatchcase(name, pattern) or fnmatchcase(name, pattern + rest)
+        for pattern, rest in zip(patterns, rests, strict=True)
     )
 
 
@@ -347,10 +349,3 @@ def refuse_unknown(outputs: Path, runs: Iterable[str]) -> None:
         patterns = named_by(outputs, [text])
         if not any(fits(name, patterns) for name in names):
             raise ConfigError(f"runs={text}: no such run under {outputs / 'runs'}; {nearest(text, names)}")
-
-
-def _runs_of_decision(outputs: Path, name: str) -> list[str]:
-    """Return the runs of a decision; none if there is no decision of that name. Raises: Fault."""
-    folders = [RunFolder(path) for path in (outputs / "decisions").glob("decide-*") if path.name == name]
-    found = [folder.config.get("runs") for folder in folders]
-    return [run for runs in found if isinstance(runs, list) for run in runs if isinstance(run, str)]

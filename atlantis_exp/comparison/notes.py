@@ -4,21 +4,19 @@ import json
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import isclose, nan
 from statistics import fmean, variance
 
 from atlantis_exp.comparison.account import seeds_between
-from atlantis_exp.comparison.choosing import COMMIT, resolve, values_in
+from atlantis_exp.comparison.choosing import COMMIT, holders, resolve, values_in
 from atlantis_exp.comparison.decision import (
     Look,
     Verdict,
     condition,
-    equal_scores,
     improvement,
     may_be_best,
     modes,
-    no_worse,
     seeds_needed,
     size_found,
 )
@@ -32,7 +30,6 @@ from atlantis_exp.terminal import PROGRAM
 
 _LENGTH = re.compile(r"phase\.\d+\.(episodes|steps)")
 _SHARES = {"frames": "{:,.0f} frames", "hours": "{:.2f} hours", "flops": "{:.3g} FLOPs"}  # by axis
-_NAMED = 6  # runs, up to which a line names them
 
 
 @dataclass(frozen=True)
@@ -63,126 +60,101 @@ class Facts:
 Note = Callable[[Facts], Iterator[str]]
 
 
-def by_training(facts: Facts) -> Iterator[str]:
-    """Say what a training score is."""
+def stands(facts: Facts) -> Iterator[str]:
+    """Say what each answer rests on: score, looks, seeds, error, length of training, and other questions."""
     if facts.question.score == "training":
         yield f"The score is {measure(facts.question)}."
-
-
-def stands(facts: Facts) -> Iterator[str]:
-    """Say what each answer rests on: looks, seeds, error, length of training, and other questions."""
     length = f"; trained for up to {facts.frames:,.0f} frames" if facts.frames else ""
     for answer in facts.answers:
         yield f"By {answer.family.name}: {spent(answer)}{length}."
     yield from facts.account
 
 
-def conditions(facts: Facts) -> Iterator[str]:
-    """Say how much each verdict leans on its condition, and how much its difference is overstated."""
-    for _, look, verdict, values in _looked_at(facts):
-        if verdict.said in ("better", "worse"):
-            one, other = _better_first(verdict)
-            found = condition(verdict, look, values)
-            yield (
-                f"{one} against {other}: looks find large differences first; the true one is rather "
-                f"{abs(size_found(verdict, look)):,.0f} points. The error holds for groups whose seeds are spread "
-                f"alike: here by {found.spreads:.1f} times as much in one as in the other, and if "
-                f"{found.undone_by:.0%} of the seeds of {one} collapsed, it would be no better; "
-                f"{verdict.seeds} seeds without a collapse leave up to {found.unseen:.0%} possible."
-            )
-
-
 def further_answers(facts: Facts) -> Iterator[str]:
     """Say which groups may be best, and of a few pairs how often a seed wins, and what remains possible."""
     for answer in facts.answers:
-        plan, verdicts = answer.family.plan, answer.decision.verdicts
-        best = may_be_best(answer.decision)
+        plan, best = answer.family.plan, may_be_best(answer.decision)
         if plan.baseline is None and 1 < len(best) < len(answer.family.seeds):
-            yield f"By {answer.family.name}, with {1 - plan.error:.0%} the best is one of {listed(best)}."
-    for answer, look, verdict, values in _looked_at(facts):
-        plan, verdicts = answer.family.plan, answer.decision.verdicts
-        if len(verdicts) > IN_FULL:
+            yield f"By {answer.family.name}, with {1 - plan.error:.0%} the best is one of {', '.join(best)}."
+    for answer, look, verdict in _looked_at(facts):
+        plan, pairs = answer.family.plan, len(answer.decision.verdicts)
+        if pairs > IN_FULL:
             continue
-        one, other = _better_first(verdict)
-        seeds = [[values[name][seed] for seed in look.seeds[name]] for name in (one, other)]
-        low, share, high = improvement(*seeds)
+        one, other = verdict.leading.group, verdict.leading.other
+        seeds = {name: [answer.family.seeds[name][seed] for seed in look.seeds[name]] for name in (one, other)}
+        low, share, high = improvement(*seeds.values())
         said = [f"A seed of {one} beats one of {other} with {share:.0%} ({low:.0%} to {high:.0%})"]
         if verdict.said == "not decided":
-            delta = (plan.delta or 0.0) * (
-                abs(fmean(seeds[1] if plan.baseline == other else map(fmean, seeds))) if plan.relative else 1
-            )
-            turned = replace(verdict, low=-verdict.high)
+            base = fmean(seeds[plan.baseline] if plan.baseline else map(fmean, seeds.values()))
+            delta = (plan.delta or 0.0) * (abs(base) if plan.relative else 1)
             said += [
-                f"{name} is no worse by more than {margin(plan)}"
-                for name, of in ((verdict.group, verdict), (verdict.other, turned))
-                if delta and no_worse(of, delta)
+                f"{of.group} is no worse by more than {margin(plan)}"
+                for of in (verdict, verdict.turned)
+                if delta and of.low > -delta
             ]
-            spread = fmean(map(variance, seeds)) ** 0.5
-            if spread and verdict.difference:
-                needed = seeds_needed(verdict.difference, spread, plan.error, len(verdicts))
-                said.append(
-                    f"a difference of this size takes {needed or 'more than 1,000'} seeds each to be found with 80 %"
-                )
+            if verdict.difference and (spread := fmean(map(variance, seeds.values())) ** 0.5):
+                needed = seeds_needed(verdict.difference, spread, plan.error, pairs) or "more than 1,000"
+                said.append(f"a difference of this size takes {needed} seeds each to be found with 80 %")
         yield f"{'; '.join(said)}."
 
 
-def _looked_at(facts: Facts) -> Iterator[tuple[Answer, Look, Verdict, dict[str, dict[int, float]]]]:
-    """Yield the last verdict of each pair with its look and the families' values, where the look's seeds are there."""
+def conditions(facts: Facts) -> Iterator[str]:
+    """Say how much a look overstates each difference, and which collapse would undo its verdict."""
+    for answer, look, verdict in _looked_at(facts):
+        if verdict.said in ("better", "worse"):
+            one, other = verdict.leading.group, verdict.leading.other
+            found = condition(verdict, look, answer.family.seeds)
+            yield (
+                f"{one} against {other}: a look overstates what it finds; the true difference is rather "
+                f"{abs(size_found(verdict, look)):,.0f} points. The verdict assumes seeds that vary alike (here "
+                f"{found.spreads:.1f} times as much in one group); it would not hold if {found.undone_by:.0%} of the "
+                f"seeds of {one} collapsed, and {verdict.seeds} seeds leave up to {found.unseen:.0%} possible."
+            )
+
+
+def _looked_at(facts: Facts) -> Iterator[tuple[Answer, Look, Verdict]]:
+    """Yield the last verdict of each pair with its look, if the look's seeds are there."""
     for answer in facts.answers:
         last = {(of.group, of.other): (look, of) for look in answer.decision.looks for of in look.verdicts}
         for pair, (look, verdict) in last.items():
             if all({*look.seeds[name]} <= answer.family.seeds[name].keys() for name in pair):
-                yield answer, look, verdict, answer.family.seeds
+                yield answer, look, verdict
 
 
-def _better_first(verdict: Verdict) -> tuple[str, str]:
-    pair = verdict.group, verdict.other
-    return pair if verdict.difference > 0 else pair[::-1]
-
-
-def collapsed(facts: Facts) -> Iterator[str]:
-    """Name policies of one action."""
+def unusual_runs(facts: Facts) -> Iterator[str]:
+    """Name runs whose policy, replay memory or code makes their scores mean less, and those that play alike."""
     for label, runs in facts.groups.items():
         if names := [run.name for run in runs if run.has_collapsed]:
             yield (
                 f"{len(names)} of {len(runs)} runs of {label} collapsed to one action, so their scores say little of "
                 f"learning: {listed(names)}."
             )
+    if alike := [f"{row['run']} as {row['same_as']}" for row in facts.tables["runs"] if row["same_as"]]:
+        yield f"The same score in every episode: {listed(alike)}."
+    if names := [run.name for run in facts.trainings if LOST in run.tags]:
+        yield f"Went on without a part of their replay memory, which was damaged: {listed(names)}."
+    if COMMIT in facts.by and (names := [run.name for run in facts.trainings if run.tags.get("git.dirty") == "true"]):
+        yield f"Made with changes that their commit does not hold: {listed(names)}."
 
 
-def lost_seeds(facts: Facts) -> Iterator[str]:
-    """Name seeds of a group whose runs are unfinished, failed or damaged."""
+def missing_seeds(facts: Facts) -> Iterator[str]:
+    """Name seeds that a group lacks: unfinished or damaged, or left out, perhaps for their scores."""
+    seeds = {label: {run.config["seed"] for run in runs} for label, runs in facts.groups.items()}
     names = defaultdict(list)
     for run in facts.lost:
         label = " ".join(values_in(run.facts, facts.by)) or "all"
-        if run.config["seed"] not in {there.config["seed"] for there in facts.groups.get(label, ())}:
+        if run.config["seed"] not in seeds.get(label, ()):
             names[label].append(run.name)
     for label, missing in names.items():
         yield (
             f"{label} lacks {len(missing)} {'seed' if len(missing) == 1 else 'seeds'}, unfinished or unusable: "
             f"{listed(missing)}. If how it played is the reason, the others do not stand for it."
         )
-
-
-def gaps(facts: Facts) -> Iterator[str]:
-    """Name seeds that a group lacks though others have them and it has later ones: left out, perhaps, for a score."""
-    seeds = {label: {run.config["seed"] for run in runs} for label, runs in facts.groups.items()}
-    for label, missing in seeds_between(seeds, {run.config["seed"] for run in facts.lost}).items():
+    for label, left_out in seeds_between(seeds, {run.config["seed"] for run in facts.lost}).items():
         yield (
-            f"{label} goes without seed {listed([*map(str, missing)])}, which others have. If its score is the reason, "
-            f"the error does not hold."
+            f"{label} goes without seed {listed([*map(str, left_out)])}, which others have. If its score is the "
+            "reason, the error does not hold."
         )
-
-
-def equal(facts: Facts) -> Iterator[str]:
-    """Name equal lists of scores, which count like others."""
-    label_of = {run.name: label for label, runs in facts.groups.items() for run in runs}
-    alike = defaultdict(list)
-    for names in equal_scores({run.name: run.episodes.scores.tolist() for run in facts.trainings}):
-        alike[tuple(dict.fromkeys(label_of[name] for name in names))].extend(names)
-    for labels, names in alike.items():
-        has = "has" if len(labels) == 1 else "have"
-        yield f"{' and '.join(labels)} {has} runs with the same score in every episode: {listed(names)}."
 
 
 def modes_found(facts: Facts) -> Iterator[str]:
@@ -191,39 +163,32 @@ def modes_found(facts: Facts) -> Iterator[str]:
     for group in facts.scored:
         if (found := modes(list(group.seeds.values()))) is not None:
             row = played.get(group.label)
+            episodes = row and (
+                f"; {row['time_cap_share']:.0%} of its episodes reach the time cap, at {row['points_per_frame']:.3g} "
+                "points per frame"
+            )
             yield (
                 f"{group.label} falls into two modes: {found.share:.0%} of its seeds score {found.upper:,.0f} on "
-                f"average, the others {found.lower:,.0f}"
-            ) + (
-                f"; {row['time_cap_share']:.0%} of its episodes reach the time cap, at {row['points_per_frame']:.3g} "
-                "points per frame."
-                if row
-                else "."
+                f"average, the others {found.lower:,.0f}{episodes or ''}."
             )
 
 
 def unlike(facts: Facts) -> Iterator[str]:
     """Name differences between runs that their identity leaves out; a tag that some lack may differ there."""
-    runs = facts.trainings
     subjects: dict[str, Callable[[Training], str]] = {
         "made in different precisions": lambda run: run.tags.get("precision", "not recorded"),
         "made on different devices": lambda run: run.tags.get("device", "not recorded"),
-        "made on different processors, so that equal hours are not equal work": (
+        "made on different processors, so equal hours are not equal work": (
             lambda run: run.tags.get("processor", "not recorded")
         ),
-        "evaluated by different numbers of episodes, each by its latest evaluation": (
-            lambda run: f"{run.episodes.scores.size:,}"
-        ),
+        "evaluated by different numbers of episodes": lambda run: f"{run.episodes.scores.size:,}",
     }
     if not {"budget.steps", "budget.flops"} & set(facts.by):
         subjects["not trained equally long"] = _ended_by
     for how, value in subjects.items():
-        holders = defaultdict(list)
-        for run in runs:
-            holders[value(run)].append(run.name)
-        if len(holders) > 1:
-            named = "; ".join(f"{value}: {listed(names)}" for value, names in sorted(holders.items()))
-            yield f"The runs were {how}: {named}."
+        values = {run.name: value(run) for run in facts.trainings}
+        if len({*values.values()}) > 1:
+            yield f"The runs were {how}: {holders(values)}."
 
 
 def _ended_by(run: Training) -> str:
@@ -233,60 +198,38 @@ def _ended_by(run: Training) -> str:
     return " ".join([*limits, f"budget.flops={flops:g}"] if flops else limits) or "the whole plan"
 
 
-def lossy(facts: Facts) -> Iterator[str]:
-    """Name runs that went on without a part of their replay memory."""
-    if names := [run.name for run in facts.trainings if LOST in run.tags]:
-        yield f"Went on without a part of their replay memory, which was damaged: {listed(names)}."
-
-
-def uncommitted(facts: Facts) -> Iterator[str]:
-    """Name runs of code that no commit holds, if commits are compared."""
-    names = [run.name for run in facts.trainings if run.tags.get("git.dirty") == "true"]
-    if COMMIT in facts.by and names:
-        yield f"Made with changes that their commit does not hold: {listed(names)}."
-
-
 def unbalanced(facts: Facts) -> Iterator[str]:
-    """Name groups that a key's values cannot be averaged over, and keys that are not answered by themselves."""
+    """Name groups and seeds that an average leaves out, and keys that are not answered by themselves."""
     for answer in facts.answers:
         family = answer.family
         if family.left_out:
-            yield (
-                f"By {family.name}, groups without a counterpart for every value are left out: "
-                f"{listed(family.left_out)}."
-            )
+            left_out = listed(family.left_out)
+            yield f"By {family.name}, groups without a counterpart for every value are left out: {left_out}."
         for value, members in family.groups.items():
             if members and (alone := set.union(*(set(group.seeds) for group in members)) - family.seeds[value].keys()):
-                yield (
-                    f"By {family.name}, {value} goes without seed {', '.join(map(str, sorted(alone)))}, which not all "
-                    f"of its groups have."
-                )
+                seeds = listed([*map(str, sorted(alone))])
+                yield f"By {family.name}, {value} goes without seed {seeds}, which not all of its groups have."
     names = [answer.family.name for answer in facts.answers]
     if facts.answers and "," in names[-1]:
         for key in set(names[-1].split(",")) - set(names):
             yield f"{key} is not answered by itself: its values share no value of the other keys."
 
 
-def later_seeds(facts: Facts) -> Iterator[str]:
-    """Name groups with more seeds than the look that a verdict rests on."""
+def moved_seeds(facts: Facts) -> Iterator[str]:
+    """Name groups with more seeds than the look of a verdict, and pairs whose seeds at a look are gone or changed."""
     late: dict[str, int] = {}
     for answer in facts.answers:
-        counts = {value: len(seeds) for value, seeds in answer.family.seeds.items()}
         for verdict in answer.decision.verdicts:
-            late |= {
-                value: counts[value] for value in (verdict.group, verdict.other) if 0 < verdict.seeds < counts[value]
-            }
+            for value in (verdict.group, verdict.other):
+                if 0 < verdict.seeds < (there := len(answer.family.seeds[value])):
+                    late[value] = there
     if late:
         yield (
             "Verdicts rest on the seeds of their looks, scores are of all seeds there are: "
             f"{listed([f'{value} has {seeds}' for value, seeds in late.items()])}."
         )
-
-
-def moved_seeds(facts: Facts) -> Iterator[str]:
-    """Name pairs whose seeds at a look are gone, or have other scores now."""
     for answer in facts.answers:
-        stands: dict[str, bool] = {}
+        moved: dict[str, bool] = {}
         for look in answer.decision.looks:
             means = {
                 value: fmean(answer.family.seeds[value].get(seed, nan) for seed in seeds)
@@ -294,12 +237,11 @@ def moved_seeds(facts: Facts) -> Iterator[str]:
             }
             for verdict in look.verdicts:
                 now = means[verdict.group] - means[verdict.other]
-                pair = f"{verdict.group} against {verdict.other}"
-                stands[pair] = isclose(now, verdict.difference, abs_tol=1e-6)
-        if moved := [pair for pair, is_so in stands.items() if not is_so]:
+                moved[f"{verdict.group} against {verdict.other}"] = not isclose(now, verdict.difference, abs_tol=1e-6)
+        if pairs := [pair for pair, is_so in moved.items() if is_so]:
             yield (
                 f"By {answer.family.name}, runs of past looks are gone or have other scores now, and their verdicts "
-                f"stay: {listed(moved)}."
+                f"stay: {listed(pairs)}."
             )
 
 
@@ -385,50 +327,38 @@ def survival_and_rate(facts: Facts) -> Iterator[str]:
     )
 
 
-def capped(facts: Facts) -> Iterator[str]:
+def time_cap(facts: Facts) -> Iterator[str]:
     """Name groups whose scores the time cap decides."""
     if shares := [
         f"{row['time_cap_share']:.0%} of {row['group']}" for row in facts.tables["evaluation"] if row["time_cap_share"]
     ]:
-        yield (
-            f"The time cap ended episodes and so decides their scores: {', '.join(shares)}; "
-            f"look at the points per frame."
-        )
+        yield f"The time cap ended episodes and so decides their scores: {', '.join(shares)}; see the points per frame."
 
 
-def measured_players(facts: Facts) -> Iterator[str]:
-    """Name players of the same game that were not trained here."""
-    if players := [row for row in facts.tables["references"] if row["name"].endswith(", measured")]:
+def other_players(facts: Facts) -> Iterator[str]:
+    """Name players of the same game, say where the random one's score is from, and why early scores are below it."""
+    references = facts.tables["references"]
+    if players := [row for row in references if row["name"].endswith(", measured")]:
         scores = [f"{row['name'].removesuffix(', measured')} {row['score']:,.0f}" for row in players]
         yield f"In the same game, on average: {', '.join(scores)}."
-
-
-def random_player(facts: Facts) -> Iterator[str]:
-    """Say where the random player's score is from, and why early scores below it are normal."""
-    if (random := random_line(facts.tables["references"])) is None:
+    if (random := random_line(references)) is None:
         return
     if random["protocol"].startswith("published"):
         yield (
             "No random player was measured under these settings, so a published one takes its place; "
             f"{PROGRAM} baseline with the same env measures one."
         )
-    is_early = facts.frames <= facts_of(facts.game).early_frames
     is_below = any(row["mean"] < random["score"] for row in facts.tables["evaluation"])
-    if is_early and is_below and (why := early_dqn(facts.game)):
+    if is_below and facts.frames <= facts_of(facts.game).early_frames and (why := early_dqn(facts.game)):
         yield why
 
 
 CAVEATS: Sequence[Note] = (
-    *(by_training, stands, further_answers, conditions, collapsed, lost_seeds, gaps, equal, modes_found, unlike, lossy),
-    uncommitted,
-    *(unbalanced, later_seeds, moved_seeds),
+    *(stands, further_answers, conditions, unusual_runs, missing_seeds, modes_found, unlike, unbalanced, moved_seeds),
 )
 """What may make a verdict mean something else."""
 
-NOTES: Sequence[Note] = (
-    *(in_training, equal_shares, mixed, begun, survival_and_rate),
-    *(capped, measured_players, random_player),
-)
+NOTES: Sequence[Note] = (*(in_training, equal_shares, mixed, begun, survival_and_rate, time_cap, other_players),)
 """What is said after it."""
 
 

@@ -13,31 +13,19 @@ Table = list[Row]
 
 
 def scores(game: Component | None) -> Table:
-    """Return the published scores of players and algorithms; none for a game without."""
+    """Return the published scores of players and algorithms; none for a game without.
+
+    Points per frame are as if all frames that the cap allows were played: the least that the rate can be.
+    """
     facts = facts_of(game)
+    of = {"points_per_frame": nan, "kind": "player", "protocol": "published, no-op starts"}
+    of["source"] = "dqn_zoo/atari_data.py (Quan and Ostrovski 2020)"
     players = {"random player": facts.random_score, "human": facts.human_score}
-    source = "dqn_zoo/atari_data.py (Quan and Ostrovski 2020)"
-    return [
-        *(
-            {
-                "name": name,
-                "score": score,
-                "points_per_frame": nan,
-                "kind": "player",
-                "protocol": "published, no-op starts",
-                "source": source,
-            }
-            for name, score in players.items()
-            if not isnan(score)
-        ),
-        *map(_with_rate, _read(game, "scores.csv")),
-    ]
-
-
-def _with_rate(row: Row) -> Row:
-    """Add points per frame, as if all frames that the cap allows were played: the least that the rate can be."""
-    capped = row.pop("capped_frames", "")
-    return {**row, "points_per_frame": row["score"] / float(capped) if capped else nan}
+    table = [{"name": name, "score": score, **of} for name, score in players.items() if not isnan(score)]
+    for row in _read(game, "scores.csv"):
+        frames = float(row.pop("capped_frames", "") or nan)
+        table.append({**row, "points_per_frame": row["score"] / frames})
+    return table
 
 
 def curves(game: Component | None) -> Table:

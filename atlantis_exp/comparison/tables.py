@@ -11,18 +11,12 @@ from math import isnan
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from atlantis_exp import documents
 from atlantis_exp.comparison.account import Account
 from atlantis_exp.comparison.choosing import plays_alike
-from atlantis_exp.comparison.decision import (
-    FEWEST_SEEDS,
-    Plan,
-    Verdict,
-    decide,
-    equal_scores,
-    mean_interval,
-)
+from atlantis_exp.comparison.decision import FEWEST_SEEDS, Plan, Verdict, decide, mean_interval
 from atlantis_exp.comparison.gather import AXES, Array, Gathered, Player, Training
 from atlantis_exp.comparison.notes import CAVEATS, NOTES, Facts
 from atlantis_exp.comparison.published import Row, Table, curves, scores
@@ -60,34 +54,30 @@ class Comparison:
         seeds: dict[tuple[str, str], dict[int, float]] = defaultdict(dict)
         for row in self.tables["seeds"]:
             seeds[row["family"], row["group"]][row["seed"]] = row["score"]
-        looks = [
-            documents.Looks(
-                family=each.family.name,
-                planned=list(each.family.plan.looks),
-                taken=[look.size for look in each.decision.looks],
-                next=each.decision.next_look,
-                error=each.family.plan.error,
-                spent=each.decision.spent,
-            )
-            for each in self.answers
-        ]
         question = asdict(self.question) | {"by": self.by, "measure": self.measure}
-        question["window"] = self.question.window if self.question.score == "training" else None
-        verdicts = [documents.PairVerdict(**row) for row in self.tables["verdict"]]
-        return documents.Compared(
-            verb=verb,
-            question=documents.Question(**question),
-            decided=bool(verdicts) and all(each.said != "not decided" for each in verdicts),
-            verdict=self.verdict,
-            others=self.others,
-            caveats=self.caveats,
-            notes=self.notes,
-            verdicts=verdicts,
-            scores=[
-                documents.GroupScore(**row | {"seeds": seeds[row["family"], row["group"]]})
-                for row in self.tables["scores"]
-            ],
-            looks=looks,
+        if self.question.score != "training":
+            question["window"] = None
+        verdicts, scores = self.tables["verdict"], self.tables["scores"]
+        return documents.Compared.model_validate(
+            {
+                "verb": verb,
+                "question": question,
+                "decided": bool(verdicts) and all(row["said"] != "not decided" for row in verdicts),
+                **{key: getattr(self, key) for key in ("verdict", "others", "caveats", "notes")},
+                "verdicts": verdicts,
+                "scores": [row | {"seeds": seeds[row["family"], row["group"]]} for row in scores],
+                "looks": [
+                    {
+                        "family": each.family.name,
+                        "planned": each.family.plan.looks,
+                        "taken": [look.size for look in each.decision.looks],
+                        "next": each.decision.next_look,
+                        "error": each.family.plan.error,
+                        "spent": each.decision.spent,
+                    }
+                    for each in self.answers
+                ],
+            }
         )
 
 
@@ -115,10 +105,10 @@ def compare(
     component = trainings[0].game if trainings else None
     game = facts_of(component)
     frames = max((float(training.curve["frames"][-1]) for training in trainings if training.curve), default=0.0)
-    by_label = {group.label: group.seeds for group in seeds_of}
+    labels = [group.label for group in seeds_of]
     named: list[tuple[str, dict[str, dict[int, float]], Answer | None]] = [
         (each.family.name, each.family.seeds, each) for each in answers
-    ] or [("all", by_label, None)]
+    ] or [("all", {group.label: group.seeds for group in seeds_of}, None)]
     tables: dict[str, Table] = {
         "scores": [row for family in named for row in _scores(*family)],
         "seeds": [
@@ -132,9 +122,12 @@ def compare(
         "looks": [row for each in answers for row in _looks(each)],
         "evaluation": [_evaluation(label, runs, game) for label, runs in groups.items()],
         "why": [_why(label, runs, game.sources) for label, runs in groups.items()],
-        "improvement": _improvement(groups),
+        "improvement": [
+            {"group": one, "over": other, "probability": probability_of_improvement(*map(_pooled, pair))}
+            for (one, other), pair in zip(combinations(groups, 2), combinations(groups.values(), 2), strict=True)
+        ],
         "views": _views(groups),
-        "runs": [row for label, runs in groups.items() for row in _runs(label, runs)],
+        "runs": _runs(groups),
         "curves": [row for axis in AXES for label, runs in groups.items() for row in _curve(axis, label, runs)],
         "seed_curves": [
             row for axis in AXES for label, runs in groups.items() for row in _seed_curves(axis, label, runs)
@@ -153,9 +146,9 @@ def compare(
     caveats, notes = ([line for note in each for line in note(facts)] for each in (CAVEATS, NOTES))
     if now and answers and all(each.taken is None for each in answers):
         caveats.append("look=now took no look: no undecided group has new seeds, or one has fewer than five.")
-    verdict, *others = _sentences(answers, list(by_label), question)
+    verdict, *others = _sentences(answers, labels, question)
     title = title_of(trainings[0].config["env.id"]) if trainings else ""
-    asked = list(by_label), list(question.by), question, measure(question)
+    asked = labels, list(question.by), question, measure(question)
     return Comparison(title, game, *asked, answers, verdict, others, caveats, notes, tables)
 
 
@@ -167,6 +160,12 @@ def to_csv(table: Table) -> str:
         writer.writeheader()
         writer.writerows(table)
     return text.getvalue()
+
+
+def _table(**columns: npt.ArrayLike) -> Table:
+    """Return the rows of columns; a single value is that of every row."""
+    values = (column.tolist() for column in np.broadcast_arrays(*columns.values()))
+    return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
 
 
 def _sentences(answers: Sequence[Answer], groups: Sequence[str], question: Question) -> list[str]:
@@ -248,11 +247,7 @@ def _evaluation(label: str, runs: Sequence[Training], game: Game) -> Row:
     return {
         "group": label,
         "runs": len(runs),
-        "episodes": summary.episodes,
-        "mean": summary.mean,
-        "median": summary.median,
-        "low": summary.low,
-        "high": summary.high,
+        **{key: getattr(summary, key) for key in ("episodes", "mean", "median", "low", "high")},
         "points_per_frame": float(_pooled(runs).sum() / frames) if frames else _NAN,
         "time_cap_share": float(_pooled(runs, "truncated").mean()),
         **({} if isnan(normalised) else {"human_normalised_mean": normalised}),
@@ -276,12 +271,12 @@ def _why(label: str, runs: Sequence[Training], sources: Sequence[str]) -> Row:
     }
 
 
-def _runs(label: str, runs: Sequence[Training]) -> Table:
-    alike = equal_scores({run.name: run.episodes.scores.tolist() for run in runs})
-    same = {name: first for first, *others in alike for name in others}
+def _runs(groups: Groups) -> Table:
+    first: dict[bytes, str] = {}  # run with these scores, in the order of the episodes
     table = []
-    for training in runs:
+    for label, training in ((label, training) for label, runs in groups.items() for training in runs):
         summary = summarize(training.episodes.scores)
+        same_as = first.setdefault(training.episodes.scores.tobytes(), training.name)
         table.append(
             {
                 "run": training.name,
@@ -296,18 +291,10 @@ def _runs(label: str, runs: Sequence[Training]) -> Table:
                 "low": summary.low,
                 "high": summary.high,
                 "policy": training.policy,
-                "same_as": same.get(training.name, ""),
+                "same_as": same_as if same_as != training.name else "",
             }
         )
     return table
-
-
-def _improvement(groups: Groups) -> Table:
-    scores = {label: _pooled(runs) for label, runs in groups.items()}
-    return [
-        {"group": one, "over": other, "probability": probability_of_improvement(scores[one], scores[other])}
-        for one, other in combinations(groups, 2)
-    ]
 
 
 def _curve(axis: str, label: str, runs: Sequence[Training]) -> Table:
@@ -315,14 +302,9 @@ def _curve(axis: str, label: str, runs: Sequence[Training]) -> Table:
     if (grid := _grid(axis, runs)) is None:
         return []
     seeds = np.array([*one_a_seed(runs, partial(_at, axis=axis, x=grid)).values()])
-    epsilons = np.mean([_at(run, axis, grid, "epsilon") for run in runs], axis=0)
-    bounds = [_mean_interval(column) for column in seeds.T]
-    return [
-        {"axis": axis, "group": label, "x": x, "score": score, "low": low, "high": high, "epsilon": epsilon}
-        for x, score, (low, high), epsilon in zip(
-            grid.tolist(), seeds.mean(axis=0).tolist(), bounds, epsilons.tolist(), strict=True
-        )
-    ]
+    epsilon = np.mean([_at(run, axis, grid, "epsilon") for run in runs], axis=0)
+    low, high = np.transpose([_mean_interval(column) for column in seeds.T])
+    return _table(axis=axis, group=label, x=grid, score=seeds.mean(axis=0), low=low, high=high, epsilon=epsilon)
 
 
 def _seed_curves(axis: str, label: str, runs: Sequence[Training]) -> Table:
@@ -330,11 +312,8 @@ def _seed_curves(axis: str, label: str, runs: Sequence[Training]) -> Table:
     seeds = {training.config["seed"] for training in runs}
     if len(runs) == 1 or len(seeds) >= FEWEST_SEEDS or (grid := _grid(axis, runs)) is None:
         return []
-    return [
-        {"axis": axis, "group": label, "run": training.name, "x": x, "score": score}
-        for training in runs
-        for x, score in zip(grid.tolist(), _at(training, axis, grid).tolist(), strict=True)
-    ]
+    of = {"axis": axis, "group": label}
+    return [row for run in runs for row in _table(**of, run=run.name, x=grid, score=_at(run, axis, grid))]
 
 
 def _grid(axis: str, runs: Sequence[Training]) -> Array | None:
@@ -360,29 +339,21 @@ def _profile(groups: Groups, game: Game) -> Table:
         taus = np.unique(np.geomspace(max(scores.min() / 2, least), max(scores.max(), 2 * least), _GRID))
     else:
         taus = np.linspace(min(scores.min(), 0.0), max(scores.max(), 1.0), _GRID)
-    return [
-        {"group": label, "tau": tau, "share": float((_pooled(runs) > tau).mean())}
-        for label, runs in groups.items()
-        for tau in taus.tolist()
-    ]
+    shares = {label: (_pooled(runs) > taus[:, None]).mean(axis=1) for label, runs in groups.items()}
+    return [row for label, share in shares.items() for row in _table(group=label, tau=taus, share=share)]
 
 
 def _actions(label: str, runs: Sequence[Training]) -> Table:
     counts = _pooled(runs, "counts").sum(axis=0)
-    return [
-        {"group": label, "action": action, "network": float(network), "random": float(chance)}
-        for action, (network, chance) in zip(runs[0].episodes.actions, counts / counts.sum(), strict=True)
-    ]
+    network, chance = (counts / counts.sum()).T
+    return _table(group=label, action=runs[0].episodes.actions, network=network, random=chance)
 
 
 def _episodes(label: str, training: Training) -> Table:
-    table = training.episodes
-    rows = zip(table.scores.tolist(), table.steps.tolist(), table.truncated.tolist(), strict=True)
-    of = {"run": training.name, "group": label}
-    return [
-        {**of, "episode": index, "score": score, "steps": int(steps), "truncated": int(truncated)}
-        for index, (score, steps, truncated) in enumerate(rows)
-    ]
+    played = training.episodes
+    steps, truncated = played.steps.astype(int), played.truncated.astype(int)
+    at = {"run": training.name, "group": label}
+    return _table(**at, episode=np.arange(steps.size), score=played.scores, steps=steps, truncated=truncated)
 
 
 def _measured(player: Player) -> Row:
@@ -411,10 +382,10 @@ def _views(groups: Groups) -> Table:
         at_end = partial(_at, axis=axis, x=shortest)
         values = {label: one_a_seed(runs, at_end) for label, runs in groups.items()}
         means = {label: float(np.mean(list(seeds.values()))) for label, seeds in values.items()}
-        intervals = _at_once(values)
+        found = _at_once(values)
         leader, *others = sorted(means, key=lambda label: -means[label])
         for other in others:
-            low, high = intervals.get((leader, other), (_NAN, _NAN))
+            verdict = found.get((leader, other), Verdict(leader, other))
             table.append(
                 {
                     "view": name,
@@ -424,22 +395,21 @@ def _views(groups: Groups) -> Table:
                     "other": other,
                     "other_score": means[other],
                     "difference": means[leader] - means[other],
-                    "low": low,
-                    "high": high,
+                    "low": verdict.low,
+                    "high": verdict.high,
                 }
             )
     return table
 
 
-def _at_once(values: Mapping[str, Mapping[int, float]]) -> dict[tuple[str, str], tuple[float, float]]:
-    """Return intervals of all differences, as one look with an error of 5 % gives them.
+def _at_once(values: Mapping[str, Mapping[int, float]]) -> dict[tuple[str, str], Verdict]:
+    """Return the verdicts of one look at all pairs with an error of 5 %, for their intervals.
 
-    There are none for fewer than `FEWEST_SEEDS` seeds. Neither are there for unequal numbers of seeds, since they would
-    not be intervals of the differences shown.
+    There are none for fewer than `FEWEST_SEEDS` seeds, nor for unequal numbers of seeds, since they would not be about
+    the differences shown.
     """
     sizes = {len(seeds) for seeds in values.values()}
     if len(sizes) > 1 or min(sizes) < FEWEST_SEEDS:
         return {}
     verdicts = decide(values, Plan(looks=(min(sizes),))).verdicts
-    intervals = {(verdict.group, verdict.other): (verdict.low, verdict.high) for verdict in verdicts}
-    return intervals | {(other, group): (-high, -low) for (group, other), (low, high) in intervals.items()}
+    return {(of.group, of.other): of for verdict in verdicts for of in (verdict, verdict.turned)}

@@ -1,8 +1,6 @@
 """Turn a question about groups of runs into families of pairs, and decide each.
 
-A seed's *score* is what `Question.score` says, a group's the mean over its seeds. No other quantity is decided about.
-`families` says what is compared with what, `answer` takes the looks that are due, and `wanted` returns the seeds that
-the next looks need.
+A seed's *score* is what `Question.score` says, a group's the mean over its seeds. Verdicts are about nothing else.
 """
 
 from collections import defaultdict
@@ -211,27 +209,17 @@ def worse_than_baseline(answers: Sequence[Answer], by: Sequence[str]) -> list[st
     """Say which groups are worse than the baseline and differ from it in their commit alone, and by how much."""
     place = list(by).index(COMMIT)
 
-    def others(answer: Answer, value: str) -> set[tuple[str, ...]]:
-        return {group.values[:place] + group.values[place + 1 :] for group in answer.family.groups[value]}
+    def split(answer: Answer, value: str) -> tuple[set[str], set[tuple[str, ...]]]:
+        """Return the commits of a value's groups, and their values of the other keys."""
+        values = [group.values for group in answer.family.groups[value]]
+        return {each[place] for each in values}, {each[:place] + each[place + 1 :] for each in values}
 
-    def commits(answer: Answer, value: str) -> set[str]:
-        return {group.values[place] for group in answer.family.groups[value]}
-
-    base = {commit for each in answers if (name := each.family.plan.baseline) for commit in commits(each, name)}
+    base = {commit for each in answers if (name := each.family.plan.baseline) for commit in split(each, name)[0]}
     lines = []
     for each in answers:  # also a family without the baseline, as of the groups behind its average
-        for verdict in each.decision.verdicts:
-            match verdict.said:
-                case "worse":
-                    worse, better, low, high = verdict.group, verdict.other, -verdict.high, -verdict.low
-                case "better":
-                    worse, better, low, high = verdict.other, verdict.group, verdict.low, verdict.high
-                case _:
-                    continue
-            is_of_baseline = commits(each, better) == base and commits(each, worse) != base
-            if is_of_baseline and others(each, worse) == others(each, better):
-                lines.append(
-                    f"{worse} by {abs(verdict.difference):,.0f} points ({low:,.0f} to {high:,.0f}, "
-                    f"{verdict.seeds} seeds each)"
-                )
+        for of in (verdict.leading for verdict in each.decision.verdicts if verdict.said in ("better", "worse")):
+            (better, rest), (worse, other_rest) = split(each, of.group), split(each, of.other)
+            if better == base != worse and rest == other_rest:
+                interval = f"{of.low:,.0f} to {of.high:,.0f}, {of.seeds} seeds each"
+                lines.append(f"{of.other} by {of.difference:,.0f} points ({interval})")
     return lines

@@ -9,7 +9,8 @@ from atlantis_exp.comparison.decision import Plan, Verdict
 from atlantis_exp.comparison.verdict import Answer, Question
 
 IN_FULL = 3  # pairs of a family, up to which each is said with its interval
-_LISTED = 6  # undecided pairs or runs, up to which they are named
+_LISTED = 6  # undecided pairs, up to which they are named
+_NAMED = 3  # of many runs
 
 
 def measure(question: Question) -> str:
@@ -29,51 +30,45 @@ def measure(question: Question) -> str:
 
 def said(answer: Answer) -> str:
     """Say what is decided and what is not; the better ones come first."""
-    verdicts = answer.decision.verdicts
+    verdicts, plan = answer.decision.verdicts, answer.family.plan
     in_full = len(verdicts) <= IN_FULL
-    baseline = answer.family.plan.baseline
     better: dict[tuple[str, str], list[str]] = defaultdict(list)
     for verdict in verdicts:
-        if verdict.said == "worse" and baseline is None:
-            better[verdict.other, "better"].append(_gap(verdict, verdict.group, in_full, turned=True))
-        elif verdict.said in ("better", "worse"):
-            better[verdict.group, verdict.said].append(
-                _gap(verdict, verdict.other, in_full, turned=verdict.said == "worse")
-            )
+        if verdict.said in ("better", "worse"):
+            leading = verdict.leading
+            by = f" by {_points(leading.difference)} points ({_interval(leading)})" if in_full else ""
+            of = verdict if plan.baseline is not None else leading
+            better[of.group, of.said].append(f"{of.other}{by}")
     sentences = [f"{name} plays {how} than {' and than '.join(others)}" for (name, how), others in better.items()]
     for verdict in verdicts:
         if verdict.said == "equivalent":
             interval = f" ({_interval(verdict)})" if in_full else ""
             sentences.append(
-                f"{verdict.group} is as good as {verdict.other}: no difference larger than "
-                f"{margin(answer.family.plan)}{interval}"
+                f"{verdict.group} is as good as {verdict.other}: no difference larger than {margin(plan)}{interval}"
             )
     if unsure := [verdict for verdict in verdicts if verdict.said == "not decided"]:
-        sentences.append(_undecided(answer, unsure))
+        sentences.append(_undecided(answer, unsure, in_full))
     return ". ".join(sentences) + "."
 
 
-def _undecided(answer: Answer, verdicts: Sequence[Verdict]) -> str:
-    decision, in_full = answer.decision, len(answer.decision.verdicts) <= IN_FULL
+def _undecided(answer: Answer, verdicts: Sequence[Verdict], in_full: bool) -> str:
+    decision = answer.decision
     if len(verdicts) > _LISTED:
         text = f"Not decided: {len(verdicts)} of {len(decision.verdicts)} pairs"
     else:
-        text = "Not decided: " + ", ".join(
-            f"{verdict.group} against {verdict.other}"
-            + (
-                f" (difference {_points(verdict.difference)}, {_interval(verdict)})"
-                if in_full and verdict.seeds
-                else ""
-            )
-            for verdict in verdicts
+        found = (
+            f" (difference {_points(of.difference)}, {_interval(of)})" if in_full and of.seeds else ""
+            for of in verdicts
         )
+        pairs = (f"{of.group} against {of.other}{interval}" for of, interval in zip(verdicts, found, strict=True))
+        text = f"Not decided: {', '.join(pairs)}"
     if decision.next_look is not None:
         there = {value: len(answer.family.seeds[value]) for value in decision.contenders}
         fewer = [f"{value} has {seeds}" for value, seeds in there.items() if seeds < decision.next_look]
-        sizes = set(there.values())
-        listed = f" ({', '.join(fewer)})" if 0 < len(fewer) <= _LISTED else ""
-        listed = f" (there are {min(sizes)} each)" if len(sizes) == 1 else listed
-        return f"{text}; next look at {decision.next_look} seeds{listed}"
+        which = f" ({', '.join(fewer)})" if 0 < len(fewer) <= _LISTED else ""
+        if len(sizes := {*there.values()}) == 1:
+            which = f" (there are {min(sizes)} each)"
+        return f"{text}; next look at {decision.next_look} seeds{which}"
     reach = max((verdict.detectable or 0.0 for verdict in verdicts), default=0.0)
     if not reach:
         return f"{text}, and there is no further look; no group's seeds differ, so what it would have found is unknown"
@@ -98,20 +93,13 @@ def margin(plan: Plan) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names in a row, the first few of many."""
-    more = len(names) - _LISTED
-    return ", ".join(names[:_LISTED]) + (f" and {more} more" if more > 0 else "")
+    """Return names in a row, the first three of many."""
+    more = len(names) - _NAMED
+    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _gap(verdict: Verdict, other: str, in_full: bool, turned: bool) -> str:
-    if not in_full:
-        return other
-    return f"{other} by {_points(abs(verdict.difference))} points ({_interval(verdict, turned)})"
-
-
-def _interval(verdict: Verdict, turned: bool = False) -> str:
-    low, high = (-verdict.high, -verdict.low) if turned else (verdict.low, verdict.high)
-    return f"{_points(low)} to {_points(high)}, {verdict.seeds} seeds each"
+def _interval(verdict: Verdict) -> str:
+    return f"{_points(verdict.low)} to {_points(verdict.high)}, {verdict.seeds} seeds each"
 
 
 def _points(value: float) -> str:

@@ -1,4 +1,4 @@
-"""Compare finished runs: hold the comparison's folder, take the looks that are due, publish and print the answers."""
+"""Compare finished runs: take the looks that are due, publish and print the answers."""
 
 import json
 import re
@@ -39,7 +39,9 @@ from atlantis_exp.media import run_colour
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.runs.provenance import provenance
-from atlantis_exp.tracking.publishing import how_to_open, publishing
+from atlantis_exp.sessions.job import labels
+from atlantis_exp.sessions.page import opened
+from atlantis_exp.tracking.publishing import how_to_open
 
 _PAGE = "comparison.html"
 
@@ -95,22 +97,17 @@ def compare(
         **of,
     }
     folder = RunFolder(outputs / "comparisons" / f"{_slug([each.label for each in scored])}-{digest(identity)}")
-    labels = {
-        "mlflow.runName": folder.name,
-        "mlflow.runColor": run_colour("comparison"),
-        "atlantis.kind": "comparison",
-    }
-    with folder.held():
+    shown = labels(folder.name, run_colour("comparison"), "comparison")
+    with opened(folder, tracking, outputs, shown, command) as journal:
         account = read_account(folder, asked, identity, [training.name for training in trainings])
         with terminal.working("computing the tables"):
             comparison = tables.compare(gathered, groups, question, account, look_now, scored)
         write_looks(folder.path, comparison.answers)
+        folder.write_config({**identity, **account.kept})
+        journal.params({key: str(value) for key, value in flatten(identity).items()})
         with terminal.working("drawing the figures"):
             figures = draw(comparison)
-        with publishing(folder, tracking, outputs, labels) as journal:
-            folder.write_config(facts := {**identity, **account.kept})
-            journal.params({key: str(value) for key, value in flatten(facts).items()})
-            _write(journal, comparison, figures, provenance(command), compared)
+        _write(journal, comparison, figures, provenance(command), compared)
     _print(comparison)
     _print_film([*trainings, *(player for player in gathered.players if plays_alike(player, trainings))])
     print(f"{how_to_open(outputs)}\n{folder.artifact(_PAGE)}")
@@ -168,7 +165,7 @@ def _write(
         "code": made.get("git.commit", made["version.atlantis-exp"]),
         "runs": compared,
     }
-    journal.tags({**made, "verdict": comparison.verdict})
+    journal.tags({"verdict": comparison.verdict})
     journal.note("\n\n".join([comparison.verdict, *comparison.others, *comparison.caveats, *comparison.notes]))
     journal.metrics(_metrics(comparison), 0)
     journal.artifact(_PAGE, page(comparison, figures, shown).encode())
@@ -177,7 +174,6 @@ def _write(
     for name, table in comparison.tables.items():
         journal.artifact(f"tables/{name}.csv", tables.to_csv(with_units(name, table)).encode())
         journal.artifact(f"tables/{name}.tex", to_latex(name, table).encode())
-    journal.finish()
 
 
 def _metrics(comparison: Comparison) -> dict[str, float]:

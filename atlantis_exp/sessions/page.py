@@ -1,4 +1,4 @@
-"""The life cycle of a page: the folder of its own in which a sweep, a search or a decision shows how it stands."""
+"""The life cycle of a page: the folder of its own in which a sweep, a search, a decision or a comparison stands."""
 
 import signal
 import sys

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 from atlantis_exp.comparison.decision import (
+    Condition,
     Decision,
     Look,
     Modes,
@@ -21,14 +22,12 @@ from atlantis_exp.comparison.decision import (
     condition,
     decide,
     detectable,
-    equal_scores,
     equivalence,
     improvement,
     looks_up_to,
     may_be_best,
     mean_interval,
     modes,
-    no_worse,
     power,
     seeds_needed,
     size_found,
@@ -270,28 +269,6 @@ def test_each_against_a_baseline() -> None:
     assert decision.verdicts[0].difference == pytest.approx(rows[0, :5].mean() - rows[1, :5].mean())
 
 
-@pytest.mark.parametrize(
-    ("groups", "plan", "looks", "message"),
-    [
-        (seeds(drawn(0)), PLAN, [], "two groups"),
-        (seeds(drawn(0, np.nan)), PLAN, [], "finite"),
-        (seeds(drawn(0, 1)), Plan(baseline="x"), [], "none of the groups a, b"),
-        (seeds(drawn(0, 1, 2)), PLAN, followed(drawn(0, 1)).looks, "other pairs"),
-    ],
-)
-def test_what_cannot_be_decided_is_refused(groups: Groups, plan: Plan, looks: list[Look], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        decide(groups, plan, looks)
-
-
-@pytest.mark.parametrize(
-    "options", [{"looks": (4,)}, {"looks": (10, 5)}, {"looks": ()}, {"error": 0.0}, {"delta": -1.0}, {"delta": np.nan}]
-)
-def test_a_plan_that_makes_no_sense_is_refused(options: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="must"):
-        Plan(**options)
-
-
 def test_looks_halve_down_to_five() -> None:
     assert [looks_up_to(size) for size in (5, 9, 10, 15, 40)] == [(5,), (9,), (5, 10), (7, 15), (5, 10, 20, 40)]
 
@@ -452,6 +429,11 @@ def test_power_at_no_difference_is_the_error_of_the_last_look_and_seeds_end_wher
 # What can be asked of a verdict.
 
 
+def is_strained(found: Condition) -> bool:
+    """Whether an unseen collapse could undo the verdict, or one spread is twice the other."""
+    return found.undone_by < found.unseen or found.spreads > 2
+
+
 def test_a_verdict_is_undone_by_the_collapse_that_makes_the_means_equal() -> None:
     groups = seeds(np.array([[80.0, 84, 88, 92, 96], [43, 43.5, 44, 44.5, 45]]))
     decision = decide(groups, Plan(looks=(5,)))
@@ -459,13 +441,13 @@ def test_a_verdict_is_undone_by_the_collapse_that_makes_the_means_equal() -> Non
     assert found.undone_by == pytest.approx(0.5)  # where half of 88 score nothing
     assert (1 - found.unseen) ** 5 == pytest.approx(0.05)
     assert found.spreads == pytest.approx(8)
-    assert found.is_strained  # for its spreads alone
+    assert is_strained(found)  # for its spreads alone
     near = seeds(drawn(100, 96) * 1.0)
     decision = decide(near, Plan(looks=(10,)))
     assert decision.verdicts[0].said == "better"
-    assert condition(decision.verdicts[0], decision.looks[0], near).is_strained  # 4 % collapsed undo it, unseen are 26
+    assert is_strained(condition(decision.verdicts[0], decision.looks[0], near))  # 4 % collapsed undo it, unseen are 26
     far = seeds(drawn(100, 50))
-    assert not condition(decide(far, Plan()).verdicts[0], decide(far, Plan()).looks[0], far).is_strained
+    assert not is_strained(condition(decide(far, Plan()).verdicts[0], decide(far, Plan()).looks[0], far))
 
 
 def test_false_verdicts_of_groups_of_one_mean_and_different_shapes_are_strained() -> None:
@@ -482,7 +464,7 @@ def test_false_verdicts_of_groups_of_one_mean_and_different_shapes_are_strained(
             decision = followed(each)
             (verdict,), look = decision.verdicts, decision.looks[-1]
             if verdict.said != "not decided":
-                passed += not condition(verdict, look, seeds(each)).is_strained
+                passed += not is_strained(condition(verdict, look, seeds(each)))
     assert passed / 300 < 0.02
 
 
@@ -513,14 +495,10 @@ def test_the_best_may_be_any_group_that_none_is_better_than() -> None:
     assert may_be_best(followed(drawn(0, 30, 0), Plan(baseline="b"))) == ["b"]
 
 
-def test_no_worse_is_what_the_interval_leaves_no_room_for() -> None:
-    (verdict,) = followed(drawn(100, 100)).verdicts
-    assert no_worse(verdict, 5.0)
-    assert not no_worse(verdict, 0.1)
-    assert not no_worse(decide(seeds(drawn(0, 0), 4), PLAN).verdicts[0], 5.0)
+def test_a_group_that_is_worse_by_a_margin_has_an_interval_within_it_in_half_the_error_at_most() -> None:
     rng = np.random.default_rng(8)
     rows = rng.normal(size=(400, 2, 10)) + np.array([[-1.0], [0.0]])  # worse by just the margin
-    assert np.mean([no_worse(followed(each).verdicts[0], 1.0) for each in rows]) < 0.025 + 0.016
+    assert np.mean([followed(each).verdicts[0].low > -1.0 for each in rows]) < 0.025 + 0.016
 
 
 def test_the_seeds_needed_are_the_fewest_with_power() -> None:
@@ -602,12 +580,6 @@ def test_a_group_without_a_collapse_is_not_taken_for_steady() -> None:
     assert said(followed((survive, collapse), Plan(looks=(5, 10))))["a", "b"] == "better"
     three = decide(seeds((survive, collapse, mixed, mixed[::-1]), 5), PLAN)
     assert said(three)["a", "b"] == "not decided"
-
-
-def test_equal_lists_are_found_in_sets() -> None:
-    scores = {"a": [1.0, 2.0], "b": [2.0, 1.0], "c": [1.0, 2.0], "d": [3.0], "e": [2.0, 1.0], "f": [1.0, 2.0]}
-    assert equal_scores(scores) == [["a", "c", "f"], ["b", "e"]]
-    assert equal_scores({}) == []
 
 
 @few

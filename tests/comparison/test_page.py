@@ -104,21 +104,6 @@ def test_the_page_says_the_verdict_the_notes_and_every_shown_table(
         assert row["name"] in text
 
 
-@pytest.mark.slow
-def test_few_episodes_are_dots_and_many_a_histogram(recorded: Recorded, tmp_path: Path) -> None:
-    def drawn() -> Drawn:
-        gathered = gather(tmp_path)
-        return draw(compare(gathered, group(gathered.trainings, ["model"]), Question(["model"])))["distribution"]
-
-    recorded(scores=[100.0] * 10 + [float(score) for score in range(10, 29)])
-    few = drawn()
-    assert few.alt.startswith("One dot an evaluated episode")
-    assert few.svg.count("<use ") > 29  # a marker each, and ticks
-    recorded("seed=1", scores=[100.0])
-    many = drawn()
-    assert many.alt.startswith("Histogram")
-
-
 def test_scores_within_a_decade_are_marked_in_thousands(recorded: Recorded, tmp_path: Path) -> None:
     recorded(scores=(2_100.0, 5_200.0))
     gathered = gather(tmp_path)

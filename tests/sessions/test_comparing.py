@@ -67,6 +67,28 @@ def test_a_comparison_is_a_page_figures_and_tables_in_a_folder_and_in_the_store(
     assert "cnn-vs-resnet" in stored.info.run_name
 
 
+def test_a_comparison_of_more_seeds_goes_on_in_its_run_and_one_that_fails_says_so(
+    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(comparing, "draw", lambda _: {})
+    for seed in range(6):
+        for model, factor in (("cnn", 3), ("resnet", 7)):
+            recorded(f"model={model}", f"seed={seed}", scores=(1_000.0, 1_200.0 + factor * seed % 5))
+        if seed > 3:
+            VERB.run([f"paths.outputs={tmp_path}"])
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path}/mlflow.db")
+    (stored,) = client.search_runs(
+        [each.experiment_id for each in client.search_experiments(filter_string="name='atlantis'")]
+    )
+    assert (stored.info.status, stored.data.params["seeds"]) == ("FINISHED", "10")
+    assert "next look at 10 seeds (there are 6 each)" in stored.data.tags["mlflow.note.content"]
+    (looks,) = tmp_path.glob("comparisons/*/looks.json")
+    looks.write_text("{")
+    with pytest.raises(SystemExit, match="1"):
+        VERB.run([f"paths.outputs={tmp_path}", "tracking=none"])
+    assert RunFolder(looks.parent).state == "failed"
+
+
 @pytest.mark.slow
 def test_the_same_comparison_again_is_the_same_run(recorded: Recorded, tmp_path: Path) -> None:
     recorded()
