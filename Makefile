@@ -18,11 +18,21 @@ $(VENV)/.installed: pyproject.toml
 
 setup: $(VENV)/.installed  ## create .venv and install everything
 
-run: setup  ## random baseline, both networks trained, the shipped one plays; a film, a page, a verdict
-	$(BIN)/python -m atlantis_exp baseline evaluation=quick
+run: setup  ## the repo's answer into MLflow, two short trainings, the best shipped player's film, the verdict
+	@echo '1 of 4: the kept runs of the answer into outputs/ and its MLflow store'
+	@cp -R -n results/verdict/. outputs/ || test -d outputs/decisions/decide-7cfff86226  # some fail at what is there
+	$(BIN)/python -m atlantis_exp sync
+	@echo '2 of 4: two short trainings, about two minutes'
 	$(BIN)/python -m atlantis_exp -m experiment=quick model=cnn,resnet phase.quick.steps=1_500
-	$(BIN)/python -m atlantis_exp evaluate weights=pretrained/cnn_fast evaluation=quick episodes=1
-	$(BIN)/python -m atlantis_exp compare
+	@echo '3 of 4: a game of the best shipped player, about a minute'
+	$(BIN)/python -m atlantis_exp evaluate weights=pretrained/cnn_annealed evaluation=quick episodes=1
+	@echo '4 of 4: the verdict over the kept seeds'
+	$(BIN)/python -m atlantis_exp compare by=model runs=decide-7cfff86226 seeds=10 at_epsilon=0.05
+	@$(BIN)/python -c "from atlantis_exp import load_runs; \
+	short = load_runs(runs='cnn-uniform-s0,resnet-uniform-s0', where='phase.quick.steps=1500', points=2); \
+	means = ' and '.join(f'{mean:,.0f}' for mean in short.runs['evaluation/mean']); \
+	print(f'\nyour two short trainings: {means} points: too short to say anything')"
+	@echo; echo 'the film:' outputs/evaluations/cnn_annealed-*/artifacts/best_episode.mp4; echo 'all of it in a browser: make ui'
 
 test: lint  ## lint, types and the quick tests
 	$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2 --dist loadfile

@@ -7,7 +7,7 @@ steps stays, with five digits, and the whole of the last 10,000 steps.
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,18 +44,21 @@ def keep(run: RunFolder, names: Sequence[str], target: Path, steps: int = 0) -> 
 
     commit = run.commit
     assert commit is not None
-    journal = without_place(thinned((run.path / "journal.jsonl").read_bytes()[: commit.offset], steps))
-    files = {"journal.jsonl": journal, "commit.json": commit_bytes(replace(commit, offset=len(journal), parent=""))}
-    for name in names:
-        for path in run.path.glob(name):
-            files[str(path.relative_to(run.path))] = without_place(path.read_bytes())
+    files = {
+        str(path.relative_to(run.path)): without_place(path.read_bytes())
+        for name in names
+        for path in run.path.glob(name)
+    }
+    journal = without_place(thinned((run.path / "journal.jsonl").read_bytes()[: commit.offset], steps, files))
+    files["journal.jsonl"] = journal
+    files["commit.json"] = commit_bytes(replace(commit, offset=len(journal), parent=""))
     for name, content in files.items():
         (target / name).parent.mkdir(parents=True, exist_ok=True)
         (target / name).write_bytes(content)
     print(target)
 
 
-def thinned(journal: bytes, steps: int) -> bytes:
+def thinned(journal: bytes, steps: int, files: Collection[str]) -> bytes:
     """Return a journal with fewer points of its training's curve, only the last note, and no file that is not kept."""
     lines, records = journal.splitlines(keepends=True), [json.loads(line) for line in journal.splitlines()]
     last_note = max((at for at, record in enumerate(records) if NOTE in record.get("values", {})), default=-1)
@@ -63,6 +66,8 @@ def thinned(journal: bytes, steps: int) -> bytes:
     kept, taken = list[bytes](), -1  # the cell of the grid that has its point
     for at, (line, record) in enumerate(zip(lines, records, strict=True)):
         if record["kind"] in ("image", "model") or (set(record.get("values", {})) == {NOTE} and at != last_note):
+            continue
+        if record["kind"] == "artifact" and f"artifacts/{record['path']}" not in files:
             continue
         if is_of_the_curve(record):
             cell, is_late = record["step"] // GRID, record["step"] > steps - WHOLE

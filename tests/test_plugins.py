@@ -683,7 +683,7 @@ def test_the_examples_are_trained(command: Command, tiny_overrides: tuple[str, .
         ("extending", {"decide", "check", "baseline", "compare", "evaluate", "export", "-m", "model=mynet"}),
         (
             "first-hour",
-            {"baseline", "-m", "evaluate", "compare", "report", "experiment=quick", "new", "check", "decide"},
+            {"sync", "-m", "evaluate", "compare", "report", "experiment=quick", "new", "check", "decide"},
         ),
     ],
 )
@@ -703,8 +703,10 @@ def test_the_page_does_what_it_says(
     shutil.copytree(ROOT / "pretrained", tmp_path / "pretrained")  # where an export goes, too
     monkeypatch.chdir(tmp_path)
     blocks = "".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL))
+    shutil.copytree(ROOT / "results" / "verdict", tmp_path / "outputs")  # as `make run` does
     (recipe,) = re.findall(r"^run: .*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), re.MULTILINE)
-    lines = blocks.replace("make run\n", recipe.replace("\t$(BIN)/", "")).replace("\\\n", "").splitlines()
+    run = "".join(re.findall(r"^\t\$\(BIN\)/(python -m .*\n)", recipe, re.MULTILINE))
+    lines = blocks.replace("make run\n", run).replace("\\\n", "").replace("steps=1500", "steps=20").splitlines()
     place = f"paths.outputs={tmp_path / 'outputs'}"
     quick = replaced(tiny_overrides, "phase.quick.steps=20", "evaluation.every_steps=null", place)
     played = ("episodes=1", "evaluation.video=false", "evaluation.num_envs=1", "tracking=none", place)
@@ -713,6 +715,7 @@ def test_the_page_does_what_it_says(
         "check": ["--cfg", "job"],
         "new": [],
         "report": [place],
+        "sync": [place],
         "baseline": [*played[1:], "evaluation.episodes=1", "env.max_steps=20"],
         "compare": ["tracking=none", place],
         "evaluate": [*played, "epsilon=1"],

@@ -146,6 +146,15 @@ def test_what_has_been_kept_is_kept_as_it_is(tmp_path: Path) -> None:
     assert again == kept
 
 
+def test_a_kept_journal_names_no_file_that_was_left_out() -> None:
+    journals = [*RESULTS.glob("*/*/*/journal.jsonl")]
+    for journal in journals:
+        records = map(json.loads, journal.read_bytes().splitlines())
+        paths = [record["path"] for record in records if record["kind"] in ("artifact", "image", "model")]
+        assert all((journal.parent / "artifacts" / path).exists() for path in paths), journal
+    assert len(journals) > 40
+
+
 def test_a_kept_curve_has_a_point_every_5000_steps_and_its_whole_end() -> None:
     points = [
         record.step

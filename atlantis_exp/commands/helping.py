@@ -38,7 +38,8 @@ def help_text(verb: str, arguments: Sequence[str]) -> str:
     preset = CONF / "experiment" / f"{named.get('experiment')}.yaml"
     chosen = dict(_groups(preset)) | named if preset.is_file() else named
     path = CONF / f"{'config' if verb == 'train' else verb}.yaml"
-    keys = [*_keys(path, "")]
+    refused = ("seed", "resume") if verb == "decide" else ()  # it has the training's keys but sets these itself
+    keys = [*_without(refused, _keys(path, ""))]
     own = {match[1] for line in keys if (match := _SHOWN.match(line))}
     short, full = [], []
     groups = dict(_groups(path))

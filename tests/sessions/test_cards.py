@@ -121,6 +121,14 @@ def test_a_card_that_is_none_is_one_line(
     assert error.count("\n") == 1
 
 
+def test_where_the_shipped_weights_are_is_said_outside_a_checkout(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert command("evaluate", "weights=pretrained/cnn_fast", f"paths.outputs={tmp_path}/o") == 2
+    assert "the shipped weights are in pretrained/ of the repository" in capsys.readouterr().err
+
+
 def test_a_pipe_in_a_card_s_place_is_one_line(
     command: Command, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
