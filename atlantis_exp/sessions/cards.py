@@ -60,7 +60,7 @@ def read_card(folder: Path) -> tuple[Card, bytes]:
         has = (
             ""
             if folder.parent.exists()
-            else "; the shipped weights are in pretrained/ of the repository, not installed"
+            else "; the shipped weights are in pretrained/ of the repository"
         )
         raise ConfigError(f"weights={folder}: not a folder with a card.json{has}; {nearest(str(folder), choices)}")
     try:
