@@ -715,7 +715,7 @@ def test_the_page_does_what_it_says(
         "check": ["--cfg", "job"],
         "new": [],
         "report": [place],
-        "sync": [place],
+        "sync": ["--cfg", "job"],
         "baseline": [*played[1:], "evaluation.episodes=1", "env.max_steps=20"],
         "compare": ["tracking=none", place],
         "evaluate": [*played, "epsilon=1"],
