@@ -52,11 +52,7 @@ def read_card(folder: Path) -> tuple[Card, bytes]:
     path = folder / "card.json"  # may be a link, as in a cache of downloads: a person named this folder
     if not path.exists():
         choices = {"latest", "best", *(str(card.parent) for card in folder.parent.glob("*/card.json"))}
-        has = (
-            ""
-            if folder.parent.exists()
-            else "; the shipped weights are in pretrained/ of the repository, not installed"
-        )
+        has = "" if folder.parent.exists() else "; the shipped weights are in pretrained/ of the repository"
         raise ConfigError(f"weights={folder}: not a folder with a card.json{has}; {nearest(str(folder), choices)}")
     try:
         card = parse(Card, read_object(read_file(path.resolve(), SMALL)))
