@@ -28,7 +28,9 @@ from atlantis_exp.runs.folder import RunFolder, find_run
 from atlantis_exp.runs.journal import Artifact, Image, Journal, Metrics, Model, adopt, read
 from atlantis_exp.sessions.contracts import fingerprints
 from atlantis_exp.sessions.job import Job, replaced
+from atlantis_exp.sessions.launchers import BASIC
 from atlantis_exp.sessions.reporting import report
+from atlantis_exp.sessions.sweep import sweep
 from atlantis_exp.sessions.training import _kin, train
 from atlantis_exp.tracking.mirror import publish
 from atlantis_exp.tracking.publishing import catch_up
@@ -712,24 +714,17 @@ def test_a_sweep_runs_what_is_missing_and_tables_what_it_found(
     assert f"starting run {missing.run_name()}" in done
 
 
-def test_a_signal_that_comes_when_a_run_has_nothing_left_to_stop_ends_its_sweep(
-    tiny_overrides: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_signal_that_comes_when_a_run_has_nothing_left_to_stop_ends_its_sweep(tiny: Compose) -> None:
     trained: list[int] = []
 
     def train(job: Job) -> int:
         trained.append(job.config.seed)
         return signal.SIGTERM
 
-    monkeypatch.setattr("atlantis_exp.sessions.training.train", train)
-    monkeypatch.setattr(sys, "argv", ["atlantis_exp"])
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    words = replaced(tiny_overrides, *SHORT, f"paths.outputs={tmp_path}", "seed=0,1")
+    jobs = [Job(tiny(*SHORT, f"seed={seed}")) for seed in (0, 1)]
     with pytest.raises(SystemExit, match="143"):
-        VERB.run([*words, "hydra/launcher=basic", "-m"])
+        sweep(jobs, BASIC, ["seed=0,1"], "again", pytest.fail, train)
     assert trained == [0]
-    VERB.run(replaced(words, "seed=2"))  # done, so what one is to do
-    assert trained == [0, 2]
 
 
 @pytest.mark.slow
