@@ -45,7 +45,7 @@ def test_ctrl_c_commits_a_training_which_the_same_call_continues(
     words = (*kept, "phase.quick.steps=100_000", f"paths.outputs={tmp_path}")
 
     def interrupt() -> None:
-        while not [*tmp_path.glob("runs/*/journal.jsonl")]:
+        while not [*tmp_path.glob("runs/*/config.json")]:
             time.sleep(0.05)
         signal.raise_signal(signal.SIGINT)
 
