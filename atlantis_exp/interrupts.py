@@ -18,7 +18,7 @@ def listen() -> None:
 
 
 def hold() -> None:
-    """From now on note a SIGINT and raise KeyboardInterrupt: work begins."""
+    """Note a SIGINT and raise KeyboardInterrupt from now on: work begins."""
     if signal.getsignal(signal.SIGINT) is _leave:
         signal.signal(signal.SIGINT, _note)
         sys.unraisablehook = _quiet

@@ -39,7 +39,7 @@ class TrainingEpisodes:
             if not all((np.abs(column) <= 1e15).all() for column in columns) or (columns[1] < 1).any():
                 raise ValueError("it has numbers beyond 1e15 or episodes without a step")
         except (ValueError, TypeError, KeyError, csv.Error) as error:
-            raise ValueError(f"{path} is no table of a training's episodes: {error}") from None
+            raise ValueError(f"{path} is not a table of a training's episodes: {error}") from None
         return cls(*columns)
 
 

@@ -43,7 +43,7 @@ def read_looks(folder: Path, families: Sequence[Family], continued: Collection[s
     except (ValueError, OSError) as error:
         reason = "its form is wrong" if isinstance(error, ValidationError) else error
         raise Fault(
-            f"{path} is no record of this comparison's looks ({reason}): restore it, for without it the error that "
+            f"{path} is not a record of this comparison's looks ({reason}): restore it, for without it the error that "
             f"they spent would be spent again"
         ) from None
     return record

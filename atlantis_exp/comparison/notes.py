@@ -158,7 +158,7 @@ def missing_seeds(facts: Facts) -> Iterator[str]:
 
 
 def modes_found(facts: Facts) -> Iterator[str]:
-    """Describe seeds that fall into two modes: their mean is no score of either."""
+    """Describe seeds that fall into two modes: their mean is the score of neither."""
     played = {row["group"]: row for row in facts.tables["evaluation"]}
     for group in facts.scored:
         if (found := modes(list(group.seeds.values()))) is not None:

@@ -95,7 +95,7 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
         raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
     if config.resume == "must" and not folder.has_started:
         raise ConfigError(f"resume=must: there is no run {folder.name} under {job.outputs / 'runs'}")
-    # A sweep's launcher has put aside what was there, and its next try of a job, as Slurm's, is no new run.
+    # A sweep's launcher has put aside what was there, and its next try of a job, as Slurm's, continues the run.
     is_first = job.launcher is None and not job.machine.slurm_restarts
     if config.resume == "never" and is_first and folder.has_started:
         parent = folder.parent

@@ -105,7 +105,7 @@ def test_games_that_outlast_the_window_are_refused(folder: str, run: str, steps:
 
 def test_a_table_that_is_none_is_named(tmp_path: Path) -> None:
     (tmp_path / "episodes.csv").write_text("episode,step,length\n1,2,3\n")
-    with pytest.raises(ValueError, match=r"episodes\.csv is no table of a training's episodes"):
+    with pytest.raises(ValueError, match=r"episodes\.csv is not a table of a training's episodes"):
         TrainingEpisodes.read(tmp_path / "episodes.csv")
 
 

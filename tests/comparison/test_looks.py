@@ -106,7 +106,8 @@ def test_a_record_that_the_comparison_cannot_have_written_is_refused_with_the_re
     with pytest.raises(Fault) as refused:
         read_looks(tmp_path, asked())
     assert re.search(
-        rf"is no record of this comparison's looks \((its looks by model )?({reason})\): restore it", str(refused.value)
+        rf"is not a record of this comparison's looks \((its looks by model )?({reason})\): restore it",
+        str(refused.value),
     )
 
 
@@ -135,7 +136,9 @@ def test_a_torn_record_is_one_line(tmp_path: Path, strike: Callable[[str], str])
     written(tmp_path)
     path = tmp_path / "looks.json"
     path.write_text(strike(path.read_text()))
-    with pytest.raises(Fault, match=r"^.*looks.json is no record of this comparison's looks \(its form is wrong\).*$"):
+    with pytest.raises(
+        Fault, match=r"^.*looks.json is not a record of this comparison's looks \(its form is wrong\).*$"
+    ):
         read_looks(tmp_path, asked())
 
 

@@ -367,7 +367,7 @@ def test_pairs_that_a_look_leaves_open_have_the_next_one_at_once_where_their_see
 def test_what_would_have_been_found_is_not_said_of_seeds_that_do_not_differ() -> None:
     runs = [of(model, seed, (2_000.0,) * 4) for model in ("cnn", "resnet") for seed in range(5)]
     last = compared(runs, seeds=5).verdict
-    assert last.endswith("no group's seeds differ, so what it would have found is unknown.")
+    assert last.endswith("the detectable difference is unknown, for seeds do not differ.")
     assert "80 %" not in last
 
 
@@ -645,7 +645,7 @@ def test_the_same_question_of_more_seeds_is_the_same_comparison_and_remembers_it
     path = the_folder(tmp_path) / "looks.json"
     whole = path.read_text()
     path.write_text(whole[:-20])
-    assert run(code=1).startswith(f"atlantis_exp: {path} is no record of this comparison's looks (")
+    assert run(code=1).startswith(f"atlantis_exp: {path} is not a record of this comparison's looks (")
     path.write_text(whole)
     run("delta=5%")
     assert len(list((tmp_path / "comparisons").iterdir())) == 2
@@ -684,7 +684,7 @@ def test_runs_that_were_asked_before_go_on_with_their_looks_and_are_told_of_othe
     broken = next((tmp_path / "comparisons").glob("cnn-vs-resnet-vs-*")) / "looks.json"
     broken.write_text("{}"[:1])
     assert f"cannot be read: {broken.parent.name}." in run("runs=cnn,resnet-")
-    assert run(code=1).startswith(f"atlantis_exp: {broken} is no record")
+    assert run(code=1).startswith(f"atlantis_exp: {broken} is not a record")
 
 
 OLD, NEW = "0123456789abcdef0123456789abcdef01234567", "fedcba9876543210fedcba9876543210fedcba98"
