@@ -10,7 +10,6 @@ from atlantis_exp.commands import compare as _comparing
 from atlantis_exp.commands import evaluate as _evaluating
 from atlantis_exp.commands import train as _training
 from atlantis_exp.commands.app import Verb
-from atlantis_exp.commands.overrides import located
 from atlantis_exp.comparison.tables import Comparison
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.folder import RunFolder
@@ -42,8 +41,7 @@ def compare(*overrides: str) -> Comparison:
 
 def _done(verb: Verb[T], overrides: tuple[str, ...]) -> tuple[T, object]:
     """Return the checked config of one job, and what its verb returns."""
-    typed = located(list(overrides))
-    asked = verb.asked(verb.rewrite(list(typed)), typed)
+    _, asked = verb.read(overrides)
     if len(asked) > 1:
         raise ConfigError(f"{' '.join(overrides)}: makes {len(asked)} jobs; call {verb.name} once for each")
     try:

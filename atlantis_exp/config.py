@@ -41,9 +41,9 @@ _MOST_GAMES = 64  # that an evaluation plays side by side
 Episodes = Annotated[int, Field(ge=1, le=10**6)]  # of one evaluation
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Size = Annotated[int, Field(ge=8, le=210)]
-NonNegative = Annotated[float, Field(ge=0)]
 Rate = Annotated[float, Field(ge=1e-10, le=10)]
 Scale = Annotated[float, Field(ge=1e-9, le=1e9)]
+Format = Literal["text", "json"]  # of what a verb prints
 
 
 def _check_device(device: str) -> str:

@@ -8,8 +8,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, Field, TypeAdapter
 
-Format = Literal["text", "json"]
-
 Number = Annotated[
     float | None, BeforeValidator(lambda value: value if isinstance(value, int) or isfinite(value or 0) else None)
 ]

@@ -41,7 +41,7 @@ class Verb(Generic[T]):
     name: str
     schema: type[T]
     work: Callable[[Asked[T]], Callable[[], object]]
-    """Imports the session's module and returns the call that does the work, or returns the number of a late signal."""
+    """Imports the session's module and returns the call that does the work; an int from this is a late signal."""
     config_name: str = ""  # of the file under conf/; by default the verb's name
     rewrite: Callable[[list[str]], list[str]] = list
     """Turns arguments as people write them into Hydra's overrides. Raises: ConfigError."""
@@ -54,9 +54,7 @@ class Verb(Generic[T]):
         A `Fault` or an OSError ends the process with one line and its exit code, which is 2 for a user's mistake.
         """
         try:
-            typed = located(arguments)
-            arguments = self.rewrite(list(typed))
-            asked = self.asked(arguments, typed)
+            arguments, asked = self.read(arguments)
             flags = flags_of(arguments)
             if flags.multirun:
                 interrupts.hold()
@@ -81,6 +79,12 @@ class Verb(Generic[T]):
         except OSError as error:
             terminal.warn(in_words(error))
             sys.exit(1)
+
+    def read(self, words: Sequence[str]) -> tuple[list[str], list[Asked[T]]]:
+        """Return typed words as Hydra's overrides, and the checked jobs that they ask for. Raises: ConfigError."""
+        typed = located(words)
+        arguments = self.rewrite(list(typed))
+        return arguments, self.asked(arguments, typed)
 
     def asked(self, arguments: Sequence[str], typed: Sequence[str] = ()) -> list[Asked[T]]:
         """Check every job that arguments ask for. Raises: ConfigError."""

@@ -10,8 +10,7 @@ from pydantic.dataclasses import dataclass
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.jobs import job_of, training_of
 from atlantis_exp.components import KINDS
-from atlantis_exp.config import STRICT, Config
-from atlantis_exp.documents import Format
+from atlantis_exp.config import STRICT, Config, Format
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import replaced
 

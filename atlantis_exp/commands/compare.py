@@ -12,8 +12,7 @@ from atlantis_exp import terminal
 from atlantis_exp.checking import absolute, share
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.components import Probability
-from atlantis_exp.config import STRICT, PathsConfig, TrackingConfig
-from atlantis_exp.documents import Format
+from atlantis_exp.config import STRICT, Format, PathsConfig, TrackingConfig
 from atlantis_exp.faults import ConfigError
 
 if TYPE_CHECKING:
@@ -46,8 +45,8 @@ class CompareConfig:
         margin(self.delta)
         share("window", self.window)
         of_runs = {"by": ["model"], "score": "last", "at_epsilon": None, "runs": [], "where": []}  # unless asked
-        for key, value in of_runs.items() if self.scores is not None else ():
-            if getattr(self, key) != value:
+        for key, value in of_runs.items():
+            if self.scores is not None and getattr(self, key) != value:
                 raise ConfigError(f"{key}: is of runs, not of scores={self.scores}, grouped by columns=group=NAME")
         named(self.columns)
 

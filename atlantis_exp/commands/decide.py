@@ -26,8 +26,7 @@ from atlantis_exp.commands.overrides import (
     with_first_values,
 )
 from atlantis_exp.commands.train import train_on_a_node
-from atlantis_exp.config import FREE, STRICT, Config
-from atlantis_exp.documents import Format
+from atlantis_exp.config import FREE, STRICT, Config, Format
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import command_line
 

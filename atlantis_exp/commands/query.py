@@ -6,8 +6,7 @@ from functools import partial
 from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
-from atlantis_exp.config import STRICT, Env
-from atlantis_exp.documents import Format
+from atlantis_exp.config import STRICT, Env, Format
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)

@@ -8,8 +8,7 @@ from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.compare import list_out
-from atlantis_exp.config import STRICT, PathsConfig
-from atlantis_exp.documents import Format
+from atlantis_exp.config import STRICT, Format, PathsConfig
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)

@@ -358,7 +358,7 @@ CAVEATS: Sequence[Note] = (
 )
 """What may make a verdict mean something else."""
 
-NOTES: Sequence[Note] = (*(in_training, equal_shares, mixed, begun, survival_and_rate, time_cap, other_players),)
+NOTES: Sequence[Note] = (in_training, equal_shares, mixed, begun, survival_and_rate, time_cap, other_players)
 """What is said after it."""
 
 

@@ -93,7 +93,7 @@ def compare(
 
     Args:
         account: the looks taken before, and the error that is left.
-        scored: groups of seeds that have scores and nothing else, in place of trainings.
+        scored: the groups with the scores of their seeds; by default those of the trainings.
 
     Raises:
         ConfigError: if the baseline is not among what is compared.

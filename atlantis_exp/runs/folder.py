@@ -253,6 +253,11 @@ def find_run(outputs: Path, name: str) -> RunFolder:
     raise ConfigError(f"run={name}: no such run; {nearest(name, {folder.name for folder in folders})}")
 
 
+def has_ended(config: Config) -> bool:
+    """Return whether the training that a config is has ended, and its budget asks for no more."""
+    return RunFolder.of(config).ended(config.budget.limits) is not None
+
+
 def _read(path: Path, kind: type[T]) -> T | None:
     try:
         return schema_of(kind).validate_json(read_file(path, SMALL), strict=True) if path.exists() else None

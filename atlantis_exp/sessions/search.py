@@ -26,11 +26,11 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
 from optuna.trial import FrozenTrial, TrialState
 from rich.table import Table
-from scipy.stats import t
 
 from atlantis_exp import terminal
 from atlantis_exp.build import stream
 from atlantis_exp.checking import digest
+from atlantis_exp.comparison.decision import mean_interval
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
 from atlantis_exp.runs.files import ARTIFACT, own, read_file
@@ -332,11 +332,9 @@ def _study(file: Path, asked: Search) -> Study:
 
 
 def _interval(scores: Sequence[float]) -> str:
-    """Return the 95 % interval of a mean, by Student's t over its trainings."""
-    if (count := len(scores)) == 1:
-        return "one training"
-    half = t.ppf(0.975, count - 1) * np.std(scores, ddof=1) / np.sqrt(count)
-    return f"{np.mean(scores) - half:,.0f} to {np.mean(scores) + half:,.0f}"
+    """Return the 95 % interval of a mean over trainings."""
+    low, high = mean_interval(scores)
+    return "one training" if len(scores) == 1 else f"{low:,.0f} to {high:,.0f}"
 
 
 def _without(overrides: Sequence[str], *keys: str) -> list[str]:

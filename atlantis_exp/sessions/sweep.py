@@ -19,7 +19,7 @@ from atlantis_exp import terminal
 from atlantis_exp.build import build_trainer
 from atlantis_exp.checking import digest
 from atlantis_exp.faults import Fault
-from atlantis_exp.runs.folder import TABLE_COLUMNS, TRACEBACK, RunFolder, State
+from atlantis_exp.runs.folder import TABLE_COLUMNS, TRACEBACK, RunFolder, State, has_ended
 from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, Tracker, adopt
 from atlantis_exp.sessions.job import Job, fitted
 from atlantis_exp.sessions.launchers import BASIC, Launcher, in_turn
@@ -92,7 +92,7 @@ def ledger(
 
 def say_hours(jobs: Sequence[Job], launcher: Launcher) -> None:
     """Print how many of a sweep's jobs are trained at a time, and the hours that all take if they are as the first."""
-    left = [job for job in jobs if RunFolder.of(job.config).ended(job.config.budget.limits) is None]
+    left = [job for job in jobs if not has_ended(job.config)]
     if not left:
         return
     at_once = min(launcher.settings.get("n_jobs", 1), len(left))

@@ -56,7 +56,7 @@ Command = Callable[..., int]
         (("against=model=cnn",), "model=cnn: the same contender as the config without it"),
         (("against=model=rsenet",), "model=rsenet: no such option in conf/model; did you mean 'resnet'?"),
         (("against=model",), "'model' is not an override; write KEY=VALUE, as in model=resnet"),
-        (("model=glob(*)",), "model=glob(*): not a list of values; write them out"),
+        (("model=glob(*)",), "model=glob(*): list the options, as in model=cnn,cnn_small,resnet,resnet_fast"),
     ],
 )
 @pytest.mark.thinned(8)

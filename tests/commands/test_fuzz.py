@@ -11,7 +11,7 @@ import pytest
 from atlantis_exp.commands import VERBS
 from atlantis_exp.commands.app import Verb
 from atlantis_exp.commands.helping import key_names, options_of
-from atlantis_exp.commands.overrides import flags_of, located
+from atlantis_exp.commands.overrides import flags_of
 from atlantis_exp.faults import Fault
 
 VALUES = (
@@ -68,9 +68,7 @@ def refusal_of(name: str, words: list[str]) -> str | None:
     """What a command line is refused with, None where it is taken; all but the work is done."""
     verb: Verb[Any] = importlib.import_module(f"atlantis_exp.commands.{name}").VERB
     try:
-        typed = located(words)
-        arguments = verb.rewrite(list(typed))
-        asked = verb.asked(arguments, typed)
+        arguments, asked = verb.read(words)
         if not flags_of(arguments).cfg:
             verb.work(asked[0])
     except Fault as fault:

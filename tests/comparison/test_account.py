@@ -57,6 +57,13 @@ class Runs:
         return answered, account
 
 
+def looked_at_five_and_ten() -> Runs:
+    runs = Runs()
+    runs.ask("ten", "ab")
+    runs.ask("ten", "ab", range(10))
+    return runs
+
+
 def sizes(answered: Answer) -> list[int]:
     return [look.size for look in answered.decision.looks]
 
@@ -66,9 +73,7 @@ def said(answered: Answer) -> dict[tuple[str, str], str]:
 
 
 def test_a_longer_plan_goes_on_with_the_looks_and_the_error_of_the_shorter_one() -> None:
-    runs = Runs()
-    runs.ask("ten", "ab")
-    runs.ask("ten", "ab", range(10))
+    runs = looked_at_five_and_ten()
     longer, account = runs.ask("twenty", "ab", range(20), seeds=20)
     assert sizes(longer) == [5, 10]
     assert longer.decision.spent == pytest.approx(0.05)
@@ -80,9 +85,7 @@ def test_a_longer_plan_goes_on_with_the_looks_and_the_error_of_the_shorter_one()
 
 
 def test_a_shorter_plan_finds_the_looks_of_the_longer_one() -> None:
-    runs = Runs()
-    runs.ask("ten", "ab")
-    runs.ask("ten", "ab", range(10))
+    runs = looked_at_five_and_ten()
     shorter, _ = runs.ask("five", "ab", range(10), seeds=5)
     assert sizes(shorter) == [5, 10]
 

@@ -30,6 +30,15 @@ def written(folder: Path, **question: Any) -> list[Answer]:
     return answers
 
 
+def rewritten(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Keep two looks, and change their record."""
+    written(folder)
+    path = folder / "looks.json"
+    record = json.loads(path.read_text())
+    change(record)
+    path.write_text(json.dumps(record))
+
+
 def test_looks_are_read_as_they_were_written(tmp_path: Path) -> None:
     assert read_looks(tmp_path, asked()) == {}
     (each,) = written(tmp_path, delta=0.001, relative=True)
@@ -98,11 +107,7 @@ ERROR, SAID = "spent another error than the plan lets them", "say what their int
 def test_a_record_that_the_comparison_cannot_have_written_is_refused_with_the_reason(
     tmp_path: Path, damage: Callable[[dict[str, Any]], object], reason: str
 ) -> None:
-    written(tmp_path)
-    path = tmp_path / "looks.json"
-    record = json.loads(path.read_text())
-    damage(record)
-    path.write_text(json.dumps(record))
+    rewritten(tmp_path, damage)
     with pytest.raises(Fault) as refused:
         read_looks(tmp_path, asked())
     assert re.search(
@@ -123,11 +128,7 @@ def test_a_record_that_the_comparison_cannot_have_written_is_refused_with_the_re
 def test_a_record_may_have_any_interval_that_its_verdict_allows(
     tmp_path: Path, edge: Callable[[dict[str, Any]], None]
 ) -> None:
-    written(tmp_path)
-    path = tmp_path / "looks.json"
-    record = json.loads(path.read_text())
-    edge(record)
-    path.write_text(json.dumps(record))
+    rewritten(tmp_path, edge)
     assert len(read_looks(tmp_path, asked())["model"]) == 2
 
 

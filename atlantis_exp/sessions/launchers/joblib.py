@@ -18,7 +18,7 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import Fault
 from atlantis_exp.machine import JOB_OF, all_cores, here
 from atlantis_exp.runs.files import make_folder, no_link
-from atlantis_exp.runs.folder import OUTPUT, RunFolder
+from atlantis_exp.runs.folder import OUTPUT, RunFolder, has_ended
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.launchers import BASIC, Launcher
@@ -106,7 +106,7 @@ def shared(cores: int, n_jobs: int, jobs: Sequence[Job]) -> tuple[int, int]:
 
     n_jobs: at a time; below zero, that many fewer than one a core and one more, as joblib counts them.
     """
-    left = sum(RunFolder.of(job.config).ended(job.config.budget.limits) is None for job in jobs)
+    left = sum(not has_ended(job.config) for job in jobs)
     at_once = max(min(n_jobs if n_jobs > 0 else cores + 1 + n_jobs, left), 1)
     return at_once, max(cores // at_once, 1)
 
@@ -114,7 +114,7 @@ def shared(cores: int, n_jobs: int, jobs: Sequence[Job]) -> tuple[int, int]:
 def _train_apart(job: Job, running: _Running) -> None:
     """Train in a process of its own. Raises: Fault where the run fails."""
     config, folder = job.config, RunFolder.of(job.config)
-    if folder.ended(config.budget.limits) is not None:
+    if has_ended(config):
         return
     make_folder(folder.path)
     with open(folder.path / OUTPUT, "a+", opener=no_link) as output:
@@ -142,6 +142,6 @@ def _train_apart(job: Job, running: _Running) -> None:
     if code < 0 or code == 1:
         with suppress(Fault), folder.held():
             has_said_so = code == 1 and folder.state == "failed"
-            if not has_said_so and folder.ended(config.budget.limits) is None:  # else it died after its run's end
+            if not has_said_so and not has_ended(config):  # else it died after its run's end
                 Journal(folder.path).status("KILLED" if code < 0 else "FAILED", reason)
     raise Fault(f"run {folder.name}: {reason}; see {folder.path / OUTPUT}", exit_code=code if code > 0 else 128 - code)
