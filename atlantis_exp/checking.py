@@ -138,9 +138,10 @@ def _explain(faults: list[ErrorDetails], tree: Mapping[str, Any]) -> str:
     # A key that may hold one type or another has a fault for each.
     messages = [other["msg"] for other in faults if _locate(other, tree)[0] == path]
     alternatives = dict.fromkeys(re.sub(r"^\w+ should ", "", message) for message in messages)
+    bounds = re.sub(r"\b0\.0{4,}\d+", lambda tiny: f"{float(tiny[0]):g}", " or ".join(alternatives))
     shown = json.dumps(node)
     shown = shown if len(shown) <= 60 else f"{shown[:54]}..."
-    return f"{key}={shown}: should {' or '.join(alternatives)}"
+    return f"{key}={shown}: should {bounds}"
 
 
 def _locate(fault: ErrorDetails, tree: Mapping[str, Any]) -> tuple[list[str], Mapping[str, Any], Any]:

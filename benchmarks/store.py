@@ -103,6 +103,7 @@ def write_journal(path: Path, episodes: int, rng: np.random.Generator) -> None:
                 **{f"learning/more_{index}": float(value) for index, value in enumerate(rng.random(10))},
             }
             line(kind="metrics", step=step, time=now, values={**means, **measured})
+        line(kind="artifact", path=evaluation_at(episodes * STEPS_PER_EPISODE))
 
 
 _MEANS = {"mean_20": 20, "mean_100": 100, "best_100": 100}

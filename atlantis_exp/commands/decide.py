@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable
 from functools import cache, partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from hydra.core.override_parser.types import Glob
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
@@ -81,6 +80,8 @@ def _first_contender(arguments: list[str]) -> list[str]:
             raise ConfigError(f"{text}: decide trains seeds from 0 on, as many as it needs; drop it")
         if override.key_or_group == "resume" and override.value() != "auto":
             raise ConfigError(f"{text}: decide goes on with the runs that are there; drop it")
+        if override.is_sweep_override() and not override.is_discrete_sweep():
+            raise ConfigError(f"{text}: not a list of values; write them out, as in model=cnn,resnet_fast")
     dropped = _launchers(flags.overrides)
     return with_first_values([argument for argument in arguments if argument not in dropped])
 
@@ -108,10 +109,6 @@ def contest_of(asked: Asked[DecideConfig]) -> "Contest":
         if key == "experiment":
             raise ConfigError(
                 "experiment: a preset is not a single key; name those that differ, as in objective=dqn,quantile"
-            )
-        if several and (not override.is_discrete_sweep() or isinstance(override.value(), Glob)):
-            raise ConfigError(
-                f"{override.input_line}: not a list of values; write them out, as in model=cnn,resnet_fast"
             )
     contenders = [(), tuple(config.against)]
     if not config.against:

@@ -76,6 +76,7 @@ def test_a_question_that_cannot_be_decided_is_one_line_and_code_2_and_leaves_not
         ("model=cnn model=cnn,resnet", "model=cnn,resnet: model=cnn says something else"),
         ("model=cnn,resnet ++seed=3", "seed=3: decide trains seeds from 0 on"),
         ("model=cnn,resnet ++resume=never", "resume=never: decide goes on"),
+        ("optimizer.lr=interval(0,1)", "optimizer.lr=interval(0,1): not a list of values; write them out"),
     ],
 )
 def test_a_key_is_refused_however_it_is_written(words: str, reason: str) -> None:
