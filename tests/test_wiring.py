@@ -242,7 +242,7 @@ def test_what_was_trained_is_evaluated_compared_and_reported(
 
     assert command("compare", "by=seed", "at_epsilon=0.05", "tracking=none", place) == 0
     *_, ui, _, path = capsys.readouterr().out.rstrip().splitlines()
-    assert ui.endswith(f"ui {place}")
+    assert ui.endswith(f"ui {place} (publishes 2 runs that it lacks first)")
     page = Path(path)
     assert page.is_relative_to(tmp_path / "comparisons")
     runs = (page.parent / "tables" / "runs.csv").read_text()

@@ -1,6 +1,7 @@
 """A search with real trainings: in one process, in several, and through every way to end one."""
 
 import dataclasses
+import math
 import os
 import re
 import shlex
@@ -283,12 +284,20 @@ def test_a_trial_below_the_median_is_committed_and_can_be_trained_to_its_end(sea
 def test_a_trial_that_fails_is_recorded_and_the_search_goes_on(
     searching: Searching, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    request = searching("trials=3", space=("optimizer.lr=1e-4,1e30",))  # the larger one diverges
-    search(request)
+    def diverging(job: Job, watch: Callable[[Trainer], bool]) -> int | None:
+        def poison(trainer: Trainer) -> bool:
+            if job.config.optimizer.lr == 1.0:
+                next(trainer.learner.network.parameters()).data.fill_(math.inf)
+            return watch(trainer)
+
+        return train(job, poison)
+
+    request = searching("trials=3", space=("optimizer.lr=1e-4,1.0",))
+    search(request, diverging)
     trials = Trials(request)
     states = {(trial.params["optimizer.lr"], trial.state.name) for trial in trials.all}
-    assert states == {("0.0001", "COMPLETE"), ("1e+30", "FAIL")}
-    assert "no finite number" in capsys.readouterr().out
+    assert states == {("0.0001", "COMPLETE"), ("1.0", "FAIL")}
+    assert re.search(r"trial \d: optimizer.lr=1.0, failed: .*is not finite", capsys.readouterr().out)
 
 
 def test_a_search_without_a_trial_that_was_trained_to_its_end_says_so(searching: Searching) -> None:
