@@ -7,12 +7,14 @@ import math
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar, cast
 
 from hydra import compose
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, IntervalSweep, Override, RangeSweep
 from hydra.errors import HydraException
@@ -32,6 +34,7 @@ from atlantis_exp.sessions.launchers import BASIC, Launcher
 
 T = TypeVar("T")
 
+_PARSER = OverridesParser.create()
 _MOST_JOBS = 10_000  # of a sweep, and values of a key
 _LAUNCHERS = CONF / "hydra" / "launcher"
 
@@ -129,8 +132,7 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
     if own is not None:
         _check_config_dir(own)
     if own is not None or admitted():  # whose files may have changed
-        _composed.cache_clear()
-        _keys.cache_clear()
+        _chosen.cache_clear()
     try:
         with composing():
             configs = {tuple(job): _check_job(config_name, schema, job, own) for job in _jobs(overrides)}
@@ -149,7 +151,7 @@ def shown(config_name: str, arguments: Sequence[str]) -> str:
     """Return the composed config of a checked command line as YAML."""
     flags = flags_of(arguments)
     with composing():
-        composed = _composed(config_name, tuple(flags.overrides), flags.config_dir)
+        composed = _composed(config_name, flags.overrides, flags.config_dir)
         return OmegaConf.to_yaml(composed, resolve=flags.resolve)
 
 
@@ -212,7 +214,7 @@ def read_override(text: str) -> Override:
     if "=" not in text and not text.startswith("~"):
         raise ConfigError(f"'{text}' is not an override; write KEY=VALUE, as in model=resnet")
     try:
-        return OverridesParser.create().parse_override(text)
+        return _PARSER.parse_override(text)
     except ValueError:  # Python's
         raise ConfigError(f"{text[:60]}...: a number of more than 4,300 digits") from None
     except RecursionError:
@@ -304,7 +306,7 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
     values = {text: override for text, override in overrides.items() if text not in chosen}
     try:
         try:
-            composed = _composed(config_name, tuple(texts), own)
+            composed = _composed(config_name, texts, own)
         except (HydraException, ValueError):  # most often an unknown key, which `_check_keys` explains better
             _check_keys(values, _keys(config_name, chosen, own), groups)
             raise
@@ -317,7 +319,7 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
         raise ConfigError(f"${{{missing}}}: no such key; {hint}") from None
 
 
-def _check_keys(values: Mapping[str, Override], keys: frozenset[str], groups: set[str]) -> None:
+def _check_keys(values: Mapping[str, Override], keys: frozenset[str], groups: frozenset[str]) -> None:
     """Raise ConfigError for an override of an unknown key."""
     branches = {key.rsplit(".", depth)[0] for key in keys for depth in range(1, key.count(".") + 1)}
     for text, override in values.items():
@@ -344,20 +346,30 @@ def _offered(folder: str, name: str) -> str:
     return f"{folder}={name}: add {' or '.join(offers)}" if offers else ""
 
 
-@cache
-def _composed(config_name: str, texts: tuple[str, ...], own: Path | None) -> DictConfig:
-    """Compose a config; `own` is a folder of further options, searched after ours."""
-    return compose(config_name, [*texts, *([f"hydra.searchpath=[{quoted(f'file://{own}')}]"] if own else [])])
+def _composed(config_name: str, texts: Sequence[str], own: Path | None) -> DictConfig:
+    """Compose a config as Hydra does, whose slow part many jobs of a sweep share."""
+    groups = _groups(config_name)
+    overrides = [read_override(text) for text in texts]
+    choices = tuple(str(each.input_line) for each in overrides if _key(each) in groups)
+    config = deepcopy(_chosen(config_name, choices, own))
+    ConfigLoaderImpl._apply_overrides_to_config([each for each in overrides if _key(each) not in groups], config)
+    return config
 
 
 @cache
-def _keys(config_name: str, chosen: tuple[str, ...], own: Path | None) -> frozenset[str]:
-    """Return the keys that the chosen options of groups give, which many jobs of a sweep share."""
-    tree: Any = OmegaConf.to_container(_composed(config_name, chosen, own))
+def _chosen(config_name: str, choices: tuple[str, ...], own: Path | None) -> DictConfig:
+    """Compose the chosen options of groups; `own` is a folder of further options, searched after ours."""
+    return compose(config_name, [*choices, *([f"hydra.searchpath=[{quoted(f'file://{own}')}]"] if own else [])])
+
+
+def _keys(config_name: str, choices: tuple[str, ...], own: Path | None) -> frozenset[str]:
+    """Return the keys that the chosen options of groups give."""
+    tree: Any = OmegaConf.to_container(_chosen(config_name, choices, own))
     return frozenset(flatten(tree))
 
 
-def _groups(config_name: str) -> set[str]:
+@cache
+def _groups(config_name: str) -> frozenset[str]:
     """Return the groups of a verb's defaults list, with the package that they fill: `sampler@samplers.uniform`."""
     groups: set[str] = set()
     for entry in cast(DictConfig, OmegaConf.load(CONF / f"{config_name}.yaml")).get("defaults", ()):
@@ -365,7 +377,7 @@ def _groups(config_name: str) -> set[str]:
             groups |= {str(group) for group in entry}
         elif entry != "_self_":
             groups |= _groups(entry)
-    return groups
+    return frozenset(groups)
 
 
 def _key(override: Override) -> str:

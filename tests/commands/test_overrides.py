@@ -5,14 +5,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hydra import compose
+from omegaconf import OmegaConf
 
 from atlantis_exp.commands import VERBS
 from atlantis_exp.commands.baseline import BaselineConfig
 from atlantis_exp.commands.compare import CompareConfig
+from atlantis_exp.commands.composing import composing
 from atlantis_exp.commands.evaluate import EvaluateConfig
 from atlantis_exp.commands.export import ExportConfig
 from atlantis_exp.commands.new import NewConfig
-from atlantis_exp.commands.overrides import check, located, refuse_twice
+from atlantis_exp.commands.overrides import _composed, check, located, refuse_twice
 from atlantis_exp.commands.play import PlayConfig
 from atlantis_exp.commands.query import QueryConfig
 from atlantis_exp.commands.report import ReportConfig
@@ -339,3 +342,20 @@ def test_a_file_that_is_no_sweep_is_one_line(tmp_path: Path, text: str | None) -
 )
 def test_a_key_that_all_swept_options_have_and_the_default_one_lacks_is_taken(line: str) -> None:
     assert len(check("config", Config, ["-m", *line.split()])) == 2
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "experiment=quick model=resnet seed=3 phase.quick.steps=9 optimizer.betas=[0.1,0.2]",
+        "model=cnn_small ~phase.single +phase.mine={steps:5} sampler@samplers.uniform=prioritized",
+        "sampler=top_half phase=two_phase ~phase.first env=atlantis_v5 paths.outputs=${oc.env:HOME} threads=null",
+    ],
+)
+def test_a_config_is_composed_as_hydra_composes_it(line: str) -> None:
+    with composing():
+        expected = compose("config", line.split())
+        for _ in range(2):  # the second from what the first has kept
+            composed = _composed("config", line.split(), None)
+            assert OmegaConf.to_yaml(composed) == OmegaConf.to_yaml(expected)
+            assert OmegaConf.is_struct(composed)
