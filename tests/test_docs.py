@@ -65,6 +65,7 @@ def test_a_picture_of_trainings_is_of_their_table(picture: str, script: Callable
     assert_it_is_the_table(picture)
 
 
+@pytest.mark.slow
 def test_the_ladder_is_drawn_and_printed_as_the_page_has_it(
     script: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -98,6 +99,7 @@ def test_the_table_of_hours_is_what_the_benchmark_prints(script: Callable[..., N
     ]
 
 
+@pytest.mark.slow
 def test_the_crop_and_the_game_are_drawn(script: Callable[..., None], tmp_path: Path) -> None:
     script("make_crop_picture")
     assert_it_is_drawn("crop", share=0.05)  # it does not say by which Matplotlib

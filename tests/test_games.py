@@ -188,6 +188,7 @@ def test_a_run_of_another_game_is_one_by_its_id_and_its_plugin(tiny: Compose) ->
         make_emulator(parse(EnvConfig, stored["env"]))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("both")
 def test_runs_of_two_games_are_not_compared(
     recorded: Recorded, said: Callable[..., str], command: Command, tmp_path: Path
@@ -205,6 +206,7 @@ def test_runs_of_two_games_are_not_compared(
     assert command("compare", "where=env.id=ALE/Pong-v5", *outputs) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("both")
 def test_a_game_is_compared_by_its_own_facts_and_without_its_plugin_by_none(
     recorded: Recorded, command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -250,6 +252,7 @@ def test_frames_have_the_columns_of_the_games_that_are_read(recorded: Recorded, 
             assert part["side_vessel"].notna().all() == (ids[str(run)] == "Atlantis-v0")
 
 
+@pytest.mark.slow
 def test_the_baseline_of_another_game_is_another_with_its_plugin(command: Command, tmp_path: Path) -> None:
     words = ("agent=constant", "agent.action=2", "env=breakout", "env.max_steps=20", "evaluation=quick")
     more = ("evaluation.episodes=2", "evaluation.video=false", "tracking=none", f"paths.outputs={tmp_path}")

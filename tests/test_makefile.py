@@ -6,6 +6,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 MAKEFILE = Path(__file__).parents[1] / "Makefile"
 
 
@@ -23,6 +25,7 @@ def test_an_older_python_is_one_line_before_anything_is_made(tmp_path: Path) -> 
     assert {path.name for path in tmp_path.iterdir()} == {"pyproject.toml", "python3.10"}
 
 
+@pytest.mark.slow
 def test_run_ends_with_the_kept_verdict_apart_from_the_short_trainings(
     tmp_path: Path, recorded: Callable[..., Path]
 ) -> None:

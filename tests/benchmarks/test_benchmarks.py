@@ -126,6 +126,7 @@ def test_sb3_stores_the_bytes_of_its_arrays() -> None:
     assert 2 * state < default < 2 * state + 100
 
 
+@pytest.mark.slow
 def test_learner_relates_its_arithmetic_to_the_machines(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

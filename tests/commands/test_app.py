@@ -89,6 +89,7 @@ def test_help_says_what_a_verb_does_and_without_one_which_there_are(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_sweep_runs_the_configs_that_were_checked(
     command: Command, tiny_overrides: tuple[str, ...], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -140,7 +141,7 @@ def test_nothing_heavy_is_loaded_before_the_config_is_checked() -> None:
     assert heavy & set(done.stdout.split()) == set()
 
 
-@pytest.mark.parametrize("moments", [2, pytest.param(300, marks=[pytest.mark.slow, pytest.mark.timeout(6_000)])])
+@pytest.mark.parametrize("moments", [1, pytest.param(300, marks=[pytest.mark.slow, pytest.mark.timeout(6_000)])])
 def test_an_interrupt_at_any_moment_of_the_start_ends_a_training(
     tiny_overrides: tuple[str, ...], tmp_path: Path, moments: int
 ) -> None:

@@ -104,6 +104,7 @@ def test_the_page_says_the_verdict_the_notes_and_every_shown_table(
         assert row["name"] in text
 
 
+@pytest.mark.slow
 def test_scores_within_a_decade_are_marked_in_thousands(recorded: Recorded, tmp_path: Path) -> None:
     recorded(scores=(2_100.0, 5_200.0))
     gathered = gather(tmp_path)
@@ -159,6 +160,7 @@ def test_figures_are_pictures_of_something_and_take_on_the_pages_ink(figures: di
     assert "cnn 1,673" in figures["scores"].alt
 
 
+@pytest.mark.slow
 def test_published_curves_leave_the_picture_rather_than_flatten_what_was_trained_and_no_name_is_cut_off(
     recorded: Recorded, tmp_path: Path
 ) -> None:

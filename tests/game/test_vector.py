@@ -291,6 +291,7 @@ def await_end(pids: list[int]) -> None:
             time.sleep(0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("busy", ["sys.stdin.read()", "emulators.send([0, 0]); sys.stdin.read()"])
 def test_workers_and_their_memory_do_not_outlive_a_killed_parent(busy: str) -> None:
     shared_before = set(os.listdir("/dev/shm"))

@@ -20,6 +20,7 @@ def _faults(call: str) -> int:
     return int(subprocess.run([sys.executable, "-c", _PROBE.format(call=call)], capture_output=True, check=True).stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="speaks to glibc")
 def test_freed_memory_comes_back_without_page_faults() -> None:
     assert _faults("keep_freed_memory()") < 30 < _faults("pass")

@@ -150,6 +150,7 @@ def test_weights_that_are_not_numbers_are_not_played(
     assert "the weights are not all finite numbers" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("episodes", [10_000, 10_001, 1_000_000])
 def test_the_interval_of_a_card_of_many_episodes_takes_seconds(tiny: Compose, episodes: int) -> None:
     scores = np.random.default_rng(0).normal(1_000, 100, episodes).tolist()

@@ -113,6 +113,7 @@ def test_contenders_are_trained_level_until_a_look_decides_and_compare_says_the_
     assert {name: (tmp_path / "runs" / name / "result.json").stat().st_mtime_ns for name in began} == began
 
 
+@pytest.mark.slow
 def test_decided_pairs_are_dropped_and_each_look_is_on_the_page_once(
     asking: Asking, recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -152,6 +153,7 @@ def test_decided_pairs_are_dropped_and_each_look_is_on_the_page_once(
     assert f"`{contest.comparing}`" in note
 
 
+@pytest.mark.slow
 def test_what_stops_a_training_stops_its_decision_with_the_same_code(
     asking: Asking, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -188,6 +190,7 @@ def test_only_seeds_that_are_missing_are_trained_the_contenders_in_turns(asking:
     assert jobs == [*(("resnet", seed) for seed in range(4)), ("cnn", 4), ("resnet", 4)]
 
 
+@pytest.mark.slow
 def test_a_plan_whose_error_is_spent_trains_nothing_and_says_how_to_go_on(
     asking: Asking, recorded: Recorded, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -287,6 +290,7 @@ def test_the_command_that_compares_is_read_as_it_is_meant(asking: Asking, tmp_pa
     assert config.paths.outputs == str(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_question_about_the_training_score_is_handed_on_with_its_window(asking: Asking) -> None:
     contest = asking("optimizer.lr=0.001,0.002", "score=training", "window=25%", "format=json")
     words = shlex.split(contest.comparing)[4:]
@@ -298,6 +302,7 @@ def test_a_question_about_the_training_score_is_handed_on_with_its_window(asking
     assert asking("optimizer.lr=0.001,0.002", "window=25%").folder == asking("optimizer.lr=0.001,0.002").folder
 
 
+@pytest.mark.slow
 def test_contenders_that_explore_differently_are_refused_by_the_training_score_before_they_are_trained(
     asking: Asking,
 ) -> None:
@@ -306,6 +311,7 @@ def test_contenders_that_explore_differently_are_refused_by_the_training_score_b
         asking("epsilon=constant", "epsilon.value=0.1,0.2", "score=training")
 
 
+@pytest.mark.slow
 def test_the_same_question_is_the_same_decision_however_it_is_written(asking: Asking) -> None:
     one = asking("optimizer.lr=0.001,0.002", "budget.steps=1_000_000")
     again = asking("optimizer.lr=0.002,1e-3", "budget.steps=1000000", "threads=2", "tracking=mlflow")

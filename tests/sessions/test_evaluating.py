@@ -91,6 +91,7 @@ def test_epsilon_and_episodes_are_the_evaluations(
     assert f"evaluation.{name}=-1: should be greater than or equal to" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_held_button_scores_2000_and_the_run_holds_its_report_table_picture_and_film(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -49,6 +49,7 @@ def exported(command: Command, trained: Path, tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_training_begins_with_exported_weights_also_where_it_was_killed_before_its_first_commit(
     tiny: Compose, exported: Path, tmp_path: Path
 ) -> None:
@@ -75,6 +76,7 @@ def test_a_training_begins_with_exported_weights_also_where_it_was_killed_before
     assert RunFolder.of(config).state == "done"
 
 
+@pytest.mark.slow
 def test_an_export_of_what_began_with_weights_says_which_and_not_where(
     command: Command, tiny: Compose, exported: Path, tmp_path: Path
 ) -> None:
@@ -118,6 +120,7 @@ def test_weights_that_no_training_can_begin_with_are_one_line_and_leave_nothing(
     assert "card.json" in refused(f"training.weights={exported}")
 
 
+@pytest.mark.slow
 def test_a_page_says_that_a_network_learned_in_another_precision_than_it_plays_in(
     command: Command, tiny: Compose, tmp_path: Path
 ) -> None:
@@ -198,6 +201,7 @@ def test_an_export_neither_overwrites_nor_starts_without_weights(
     assert capsys.readouterr().err == f"atlantis_exp: to={tmp_path}/file: is not empty; name another folder\n"
 
 
+@pytest.mark.slow
 def test_an_export_to_a_full_disk_is_one_line_and_leaves_nothing(
     command: Command, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -103,6 +103,7 @@ def test_a_search_trains_its_trials_under_a_run_of_its_own_and_goes_on_where_mor
     assert page.status == "FINISHED"
 
 
+@pytest.mark.slow
 def test_a_signal_that_comes_when_a_trial_has_nothing_left_to_stop_ends_the_search_after_it(
     searching: Searching, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -117,6 +118,7 @@ def test_a_signal_that_comes_when_a_trial_has_nothing_left_to_stop_ends_the_sear
     assert [trial.state.name for trial in Trials(request).all] == ["COMPLETE"]
 
 
+@pytest.mark.slow
 def test_a_trial_that_nobody_holds_goes_on_before_a_new_one_is_drawn(searching: Searching) -> None:
     trials = trials_of(searching, "trials=3")
     with trials.claimed() as left:
@@ -197,6 +199,7 @@ def played(recorded: Callable[..., Path]) -> Played:
     return play
 
 
+@pytest.mark.slow
 def test_a_trial_is_as_good_as_the_mean_of_its_seeds(
     searching: Searching, played: Played, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -206,6 +209,7 @@ def test_a_trial_is_as_good_as_the_mean_of_its_seeds(
     assert "One training each" not in shown
 
 
+@pytest.mark.slow
 def test_values_that_are_drawn_again_are_trained_with_other_seeds(
     searching: Searching, played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -216,6 +220,7 @@ def test_values_that_are_drawn_again_are_trained_with_other_seeds(
     assert "partly luck" not in shown  # there is nothing it was chosen from
 
 
+@pytest.mark.slow
 def test_the_best_is_called_lucky_and_tested_against_the_default_with_other_seeds(
     searching: Searching, recorded: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -245,6 +250,7 @@ def test_the_best_is_called_lucky_and_tested_against_the_default_with_other_seed
     }
 
 
+@pytest.mark.slow
 def test_the_default_is_not_tested_against_itself(
     searching: Searching, played: Played, capsys: pytest.CaptureFixture[str]
 ) -> None:

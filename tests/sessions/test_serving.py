@@ -94,6 +94,7 @@ def address(outputs: Path, free_port: Callable[[], int], answering: Callable[...
     assert server.wait() == 0
 
 
+@pytest.mark.slow
 def test_the_runs_that_the_store_lacks_are_published_and_the_plain_address_leads_to_them(
     tmp_path: Path, free_port: Callable[[], int], answering: Callable[..., None]
 ) -> None:

@@ -155,6 +155,7 @@ def test_a_sweep_is_finished_once_all_its_runs_are(
     assert (page_of(tmp_path).status, page_of(tmp_path).error) == (status, reason)
 
 
+@pytest.mark.slow
 def test_a_launchers_sweep_puts_aside_what_is_to_be_begun_anew_but_what_another_process_trains(
     tiny: Compose, recorded: Callable[..., Path], tmp_path: Path
 ) -> None:
@@ -268,6 +269,7 @@ def test_a_sweep_that_a_signal_ends_is_closed(tiny: Compose, tmp_path: Path, num
     assert page_of(tmp_path).status == "KILLED"
 
 
+@pytest.mark.slow
 def test_a_larger_sweep_takes_the_runs_of_a_smaller_one_over(
     pair: list[Job], tiny: Compose, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -123,6 +123,7 @@ def shown(root: Path, run: str) -> dict[str, Any]:
     }
 
 
+@pytest.mark.slow
 def test_runs_go_to_a_server_equal_and_once_and_then_what_is_new(
     tmp_path: Path, server: tuple[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:

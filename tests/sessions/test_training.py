@@ -161,6 +161,7 @@ def test_a_run_that_has_ended_is_reported_and_not_trained_again(
     assert folder.state == "done"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gone", [".", "*/manifest.json"])
 def test_a_run_whose_checkpoints_are_gone_is_not_begun_anew_by_a_larger_budget(
     tiny: Compose, capsys: pytest.CaptureFixture[str], gone: str

@@ -137,6 +137,7 @@ def test_points_are_stored_as_mlflows_own_client_stores_them(store: Store, root:
     assert stored(lambda run: store.log_points(run, points)) == stored(theirs)
 
 
+@pytest.mark.slow
 def test_what_is_left_of_a_database_that_was_removed_is_not_played_into_the_new_one(tmp_path: Path) -> None:
     with closing(sqlite3.connect(tmp_path / "mlflow.db")) as database:
         database.execute("PRAGMA journal_mode=WAL")
