@@ -9,7 +9,6 @@ import pytest
 import torch
 from safetensors.torch import load, save
 from torch import nn
-from torch._dynamo.testing import CompileCounterWithBackend
 from torch.nn.functional import smooth_l1_loss
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -275,6 +274,8 @@ def test_a_network_whose_samples_meet_is_not_split() -> None:
 @every_network
 def test_a_compiled_learner_learns_the_same(network_class: type[nn.Module]) -> None:
     """By a backend that needs no compiler; dropout masks are drawn from the same generators."""
+    from torch._dynamo.testing import CompileCounterWithBackend  # takes as long to import as torch
+
     backend = CompileCounterWithBackend("aot_eager")
     shards = 2 if network_class is DQNCnn else 1
 
