@@ -47,7 +47,7 @@ _ABOUT = """\
   evaluations, from 0: at each position the runs stand side by side.
 - A run's page: its description has the result and how to continue it; *Artifacts* has `best_episode.mp4`,
   `episodes.csv` and every evaluation's table. *Models* lists the weights of each evaluation; `best` marks the best.
-- A sweep is a run, too: the table and figures of its runs are on its page.
+- A sweep is a run, too: the table of its runs is on its page.
 """
 
 
