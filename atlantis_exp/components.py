@@ -288,8 +288,13 @@ def _check_game(cls: type[Any], settings: Sequence[Setting]) -> None:
     low, high = cls.score_range
     if not -math.inf < low < high < math.inf:
         raise TypeError(f"score_range: should be the lowest and the highest score, not ({low}, {high})")
-    if getattr(cls, "sources", ()) and not hasattr(cls, "points"):
-        raise TypeError("sources: need a static method points(reward, ram) that returns the points of each")
+    if getattr(cls, "sources", ()):
+        try:
+            inspect.signature(getattr(cls, "points", None)).bind("reward", "ram")  # type: ignore[arg-type]
+        except TypeError:
+            raise TypeError(
+                "sources: need a static method points(reward, ram) that returns the points of each"
+            ) from None
 
 
 def _is_plain(told: Any) -> bool:
@@ -384,7 +389,7 @@ def points_of(game: Component) -> Callable[[int, Any], Sequence[float]]:
     """Return the function that splits a frame's reward; worker processes can be sent it."""
     cls = game.load()
     points: Callable[[int, Any], Sequence[float]] = cls.points
-    text = game.plugin and game.plugin.text
+    text = game.plugin.text if game.plugin else None
     return points if text is None else partial(_points, game.path, text, cls.__name__)
 
 
