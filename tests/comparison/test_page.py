@@ -169,6 +169,8 @@ def test_figures_are_pictures_of_something_and_take_on_the_pages_ink(figures: di
         assert "#24292f" not in figure.svg
         assert "cnn" in figure.svg
     assert "cnn 1,673" in figures["scores"].alt
+    # On a phone of 390 pixels a point of a figure is a pixel of the screen.
+    assert min(float(size) for size in re.findall(r"font-size: ([\d.]+)px", figures["learning_frames"].svg)) >= 9
 
 
 @pytest.mark.slow
