@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from atlantis_exp.commands import VERBS
-from atlantis_exp.commands.helping import key_names
+from atlantis_exp.commands.helping import help_text, key_names
 from atlantis_exp.learning.objectives import Objective
 from atlantis_exp.replay.samplers import Sampler
 
@@ -198,6 +198,19 @@ def test_extending_has_the_methods_of_a_sampler_and_of_an_objective_as_they_are(
             for cls in (shown, own)
         ]
         assert methods[0] == methods[1] != []
+
+
+def test_no_message_and_no_help_names_a_page_that_an_installed_package_lacks() -> None:
+    texts = [help_text(verb, ["all"]) for verb in VERBS]
+    for path in (REPOSITORY / "atlantis_exp").rglob("*.py"):
+        nodes = [*ast.walk(ast.parse(path.read_text()))]
+        docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        texts += [
+            node.value
+            for node in nodes
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings
+        ]
+    assert [text for text in texts if re.search(r"\b(docs|lab)/", text)] == []
 
 
 BANNED = re.compile(
