@@ -18,10 +18,6 @@ from atlantis_exp.tracking.store import Store
 from atlantis_exp.tracking.views import COMPARISONS, START, SWEEP, address
 
 IMAGES = Path(__file__).parent / "images"
-CLOSED = """
-localStorage.setItem('mlflow.assistant.fab.autoOpenedOnFirstLoad_v1', 'true')
-localStorage.setItem('mlflow.assistant.panelOpen_v1', 'false')
-"""  # the assistant, which MLflow opens on a first visit
 SECONDS = 8  # until a page's charts are drawn
 
 
@@ -56,7 +52,6 @@ def main() -> None:
             browser = started.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
             for width, height, ending in ((1440, 900, ""), (390, 844, "_phone")):
                 context = browser.new_context(viewport={"width": width, "height": height})
-                context.add_init_script(CLOSED)
                 page = context.new_page()
                 take(page, places[START], f"start{ending}")
                 if not ending:

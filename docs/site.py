@@ -22,7 +22,7 @@ def main(target: Path) -> None:
     (target / "lab").mkdir(parents=True)
     for folder in ("images", "data"):
         shutil.copytree(ROOT / "docs" / folder, target / folder)
-    for name in ("iframe-worker.js", "json.schema.json"):
+    for name in ("iframe-worker.js", "json.schema.json", "site.css"):
         shutil.copy(ROOT / "docs" / name, target)
     pages = {path.name: path for path in (ROOT / "docs").glob("*.md")}
     pages |= {f"lab/{path.name}": path for path in (ROOT / "lab").glob("*.md")}

@@ -35,7 +35,7 @@ MODULES = (
     *("training.checkpoint", "training.trainer", "sessions.sweep"),
 )
 ALSO = {
-    "training.trainer": ("training.checkpoint",),
+    "training.trainer": ("training.checkpoint", "hostile_files"),
     "replay.memory": ("training.checkpoint",),
     "comparison.decision": ("comparison.verdict",),
 }

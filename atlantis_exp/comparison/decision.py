@@ -262,7 +262,7 @@ def size_found(verdict: Verdict, look: Look) -> float:
         upto, smaller = nctdtr(freedom, shift, (limit, t))
         return float((below + smaller - upto) / (below + 1 - upto) - 0.5)
 
-    return float(np.sign(verdict.difference) * error * _falls_to(above_half, 0.0, t + 1))
+    return float(np.sign(verdict.difference) * error * _falls_to(above_half, 0.0, t))
 
 
 def may_be_best(decision: Decision) -> list[str]:

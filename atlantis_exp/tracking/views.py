@@ -15,8 +15,8 @@ from atlantis_exp.runs.journal import NOTE
 from atlantis_exp.tracking.local import uri_of
 
 _SECTIONS = {  # cards a row, and their height in pixels
-    "evaluation": (2, 360),
     "score": (2, 360),
+    "evaluation": (2, 360),
     "pictures": (1, 520),
     "actions": (2, 360),
     "learning": (2, 360),
@@ -30,13 +30,13 @@ _COLUMNS = (
 START, SWEEP, COMPARISONS = "start", "sweep", "comparisons"
 """The keys of the shared views, as `viewStateShareKey` in an address takes them."""
 
-_NO_PLAYERS = ("training sweep", "search", "decision", "comparison")
-"""Kinds of runs without a game of their own."""
+_APART = ("training sweep", "search", "decision", "comparison", "evaluation")
+"""Kinds of runs without a curve, and those of players from elsewhere, beside whose scores no bar would be seen."""
 
 _ABOUT = """\
 **Does network B play better than network A, and how sure is that?**
 
-- Three views are prepared (share key in the address): **Start here** has a line a player, the best evaluation first;
+- Three views are prepared (share key in the address): **Start here** has a line a training, the best evaluation first;
   **Sweep** has a line a group of runs that differ only in their seed: their mean, with its range; **Comparisons** has
   a line a comparison, the newest first, with its verdict.
 - A run's name says what differs from the defaults: network, samplers, seed, then the rest. Blues are DQNCnn, reds
@@ -47,7 +47,7 @@ _ABOUT = """\
   evaluations, from 0: at each position the runs stand side by side.
 - A run's page: its description has the result and how to continue it; *Artifacts* has `best_episode.mp4`,
   `episodes.csv` and every evaluation's table. *Models* lists the weights of each evaluation; `best` marks the best.
-- A sweep is a run, too: the table and figures of its runs are on its page.
+- A sweep is a run, too: the table of its runs is on its page.
 """
 
 
@@ -84,12 +84,22 @@ def site(outputs: Path, start: str) -> Any:
 
     with warnings.catch_warnings(action="ignore"):  # of a library that MLflow will replace
         from mlflow.server.fastapi_app import app
+    from starlette.responses import Response
 
     # Browsers do not send the part after '#' to a server: the page itself has to look.
-    lead = f"<head><script>if (!location.hash) location.replace({json.dumps(start)})</script>"
+    lead = (
+        f"<head><script>if (!location.hash) location.replace({json.dumps(start)});"
+        "localStorage.setItem('mlflow.assistant.fab.autoOpenedOnFirstLoad_v1', 'true')</script>"
+    )
     index = Path(str(pages.static_folder), "index.html").read_text().replace("<head>", lead, 1)
     pages.view_functions["serve"] = lambda: index
-    return app
+
+    async def without_assistant(scope: Any, receive: Any, send: Any) -> None:
+        """Leave out MLflow's assistant, which can run a shell and open an agent on this machine."""
+        is_assistants = "/mlflow/assistant" in scope.get("path", "")
+        await (Response(status_code=404) if is_assistants else app)(scope, receive, send)
+
+    return without_assistant
 
 
 def _start_here() -> dict[str, Any]:
@@ -99,12 +109,11 @@ def _start_here() -> dict[str, Any]:
         "showAllRuns": True,
     }
     charts = [
-        _bar("evaluation", "evaluation/interquartile_mean"),
-        _bar("evaluation", "evaluation/mean"),
-        _line("evaluation", "evaluation/mean"),
-        _chart("PARALLEL", "evaluation", **parallel),  # not among groups, which have only numbers for params
         _line("score", "score/mean_100"),
         _line("score", "score/episode"),
+        _bar("evaluation", "evaluation/interquartile_mean"),
+        _line("evaluation", "evaluation/mean"),
+        _chart("PARALLEL", "evaluation", **parallel),  # not among groups, which have only numbers for params
         _images("pictures", "score/histogram", "score/heatmap"),
         _images("pictures", "evaluation/histogram"),
         _line("actions", "actions/epsilon"),
@@ -118,7 +127,7 @@ def _start_here() -> dict[str, Any]:
         **_page(START, charts),
         # Sorted by anything but time MLflow shows a sweep's runs themselves, else their collapsed parent.
         "orderByKey": "metrics.`evaluation/interquartile_mean`",
-        "searchFilter": " AND ".join(f"tags.`atlantis.kind` != '{kind}'" for kind in _NO_PLAYERS),
+        "searchFilter": " AND ".join(f"tags.`atlantis.kind` != '{kind}'" for kind in _APART),
     }
 
 

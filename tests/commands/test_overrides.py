@@ -103,6 +103,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("optimizer.betas=[0.9,1.0]", "optimizer.betas.1=1.0", "less than 1"),
     ("seed=-1", "seed=-1", "greater than or equal to 0"),
     ("seed=1.5", "seed=1.5", "valid integer"),
+    ("budget.steps=1e6", "budget.steps=1e+06", "write budget.steps=1_000_000"),
     ("seed=true", "seed=true", "valid integer"),
     ("seed=", "seed=", "valid integer"),
     ("seed=99999999999999999999", "seed=99999999999999999999", "less than"),

@@ -184,6 +184,13 @@ def test_the_same_look_again_costs_nothing() -> None:
     assert last.next_look is None
 
 
+def test_seeds_that_were_looked_at_for_less_than_they_allow_are_not_looked_at_again() -> None:
+    groups = seeds(drawn(0, 0))
+    (look,) = decide(groups, Plan(looks=(10,))).looks
+    cheap = dataclasses.replace(look, error=0.01)
+    assert decide(groups, PLAN, [cheap]).looks == decide(groups, PLAN, [cheap], now=True).looks == [cheap]
+
+
 def test_a_look_nobody_planned_leaves_less_for_the_next() -> None:
     rows = drawn(0, 0)
     first = decide(seeds(rows, 5), PLAN)
@@ -417,6 +424,8 @@ def test_two_groups_of_one_mean_are_found_equivalent_in_eighty_of_a_hundred_with
     said_of = [followed(each, Plan(delta=delta)).verdicts[0].said for each in rows]
     assert np.mean([said == "equivalent" for said in said_of]) == pytest.approx(0.8, abs=0.05)
     assert equivalence(PLAN, 2.0, pairs=3) > 2 * delta
+    t, looks = scipy.stats.t(df=38), (5, 10, 20)  # whose last spends 0.0375
+    assert equivalence(Plan(looks), 3.0) == pytest.approx(3 * (t.ppf(1 - 0.0375 / 2) + t.ppf(0.9)) * np.sqrt(2 / 20))
 
 
 def test_power_at_no_difference_is_the_error_of_the_last_look_and_seeds_end_where_nothing_is_left_to_find() -> None:
@@ -488,6 +497,17 @@ def test_the_size_of_a_sure_difference_is_the_difference_and_turns_with_it() -> 
         )
 
 
+def test_the_size_found_among_several_pairs_is_that_of_one_pair_with_its_share_of_the_error() -> None:
+    decision = decide(seeds(drawn(2, 0, 0)), Plan(looks=(10,)))
+    verdict, look = decision.verdicts[0], decision.looks[0]
+    alone = dataclasses.replace(look, error=look.error / 3, verdicts=[verdict])
+    assert (
+        size_found(verdict, look)
+        == size_found(verdict, alone)
+        != size_found(verdict, dataclasses.replace(alone, error=0.05))
+    )
+
+
 def test_the_best_may_be_any_group_that_none_is_better_than() -> None:
     decision = followed(drawn(50, 0, 50, 20))
     assert may_be_best(decision) == ["a", "c"]
@@ -507,6 +527,15 @@ def test_the_seeds_needed_are_the_fewest_with_power() -> None:
     assert power(Plan(looks_up_to(needed)), 1.0, 1.0)[0] >= 0.8 > power(Plan(looks_up_to(needed - 1)), 1.0, 1.0)[0]
     assert seeds_needed(10.0, 1.0) == 5
     assert seeds_needed(1e-6, 1.0) is None
+
+
+def test_the_interval_of_an_improvement_is_newcombes_found_by_trying_every_value() -> None:
+    one, other = [3.0, 5.0, 6.0, 9.0, 11.0], [1.0, 2.0, 4.0, 5.5]
+    low, found, high = improvement(one, other)
+    true = np.linspace(1e-6, 1 - 1e-6, 1_000_000)
+    more = 1 + (len(one) + len(other) - 2) / 2 * ((1 - true) / (2 - true) + true / (1 + true))
+    inside = true[(found - true) ** 2 <= 1.96**2 * true * (1 - true) * more / (len(one) * len(other))]
+    assert (low, high) == pytest.approx((inside.min(), inside.max()), abs=1e-5)
 
 
 def test_the_probability_of_improvement_lies_in_its_interval_in_ninety_five_of_a_hundred() -> None:

@@ -465,3 +465,12 @@ def test_segments_of_two_memories_do_not_mix() -> None:
     played(other, 5)
     with pytest.raises(ValueError, match="a segment is missing"):
         memory_of(100).load_segments([first, other.segment(20)])
+
+
+def test_a_newest_segment_whose_links_contradict_each_other_is_refused() -> None:
+    memory = played(memory_of(100), 30)
+    written = memory.next_id
+    forged = played(memory, 20).segment(written)
+    forged["back"] = np.full_like(forged["back"], 1)  # four environments, all of one line
+    with pytest.raises(ValueError, match="has no successor"):
+        memory_of(100).load_newest([forged], memory.next_id)

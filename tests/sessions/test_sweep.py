@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import re
 import signal
 import sqlite3
 import subprocess
@@ -21,8 +22,8 @@ from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import NOTE, Artifact, Journal, Tags, read_commit
 from atlantis_exp.sessions.job import Job, fitted, replaced
-from atlantis_exp.sessions.launchers import Launcher
-from atlantis_exp.sessions.sweep import _every, ledger
+from atlantis_exp.sessions.launchers import BASIC, Launcher
+from atlantis_exp.sessions.sweep import _every, hours_of, ledger, say_hours
 from atlantis_exp.sessions.training import train
 from atlantis_exp.tracking.publishing import catch_up
 
@@ -155,7 +156,22 @@ def test_a_sweep_is_finished_once_all_its_runs_are(
     assert (page_of(tmp_path).status, page_of(tmp_path).error) == (status, reason)
 
 
-@pytest.mark.slow
+def test_a_sweep_says_how_many_trainings_go_on_at_a_time_and_for_how_long(
+    tiny: Compose, recorded: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    jobs = [Job(tiny(f"seed={seed}", "budget.forecast=warn")) for seed in (0, 1)]
+    assert 0 < hours_of(jobs[0], 1) < 1
+    say_hours(jobs, Launcher("joblib", {"n_jobs": 8, "cores": 1}))
+    told = capsys.readouterr().out.splitlines()[-1]
+    assert re.fullmatch(r"8 trainings at a time, 1 core each: about .+ if all take as long as cnn uniform s0", told)
+    say_hours([Job(tiny())], Launcher("joblib", {"n_jobs": 2, "cores": 2}))  # a forecast is not wanted
+    assert capsys.readouterr().out == "2 trainings at a time, 2 cores each\n"
+    for seed in (0, 1):
+        recorded(f"seed={seed}")
+    say_hours(jobs, BASIC)
+    assert capsys.readouterr().out == ""
+
+
 def test_a_launchers_sweep_puts_aside_what_is_to_be_begun_anew_but_what_another_process_trains(
     tiny: Compose, recorded: Callable[..., Path], tmp_path: Path
 ) -> None:

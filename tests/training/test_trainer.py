@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import torch
 
@@ -266,6 +267,50 @@ def test_updates_are_those_that_a_naive_loop_counts(
             if known > learn_start and (num_envs == 1 or known < 132):
                 naive.append(known)
     assert tape == naive
+
+
+@pytest.mark.parametrize("num_envs", [1, 8])
+def test_each_error_is_fed_back_to_its_sampler_once_before_the_next_batch_is_drawn(
+    small: Small, tmp_path: Path, num_envs: int
+) -> None:
+    tape: list[tuple[str, list[int]]] = []
+
+    class Taped(PrioritizedSampler):
+        def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> Draw:
+            draw = super().sample(memory, batch_size, rng)
+            tape.append(("drawn", draw.ids.tolist()))
+            return draw
+
+        def feed_back(self, ids: npt.NDArray[np.int64], errors: npt.NDArray[np.float32]) -> None:
+            tape.append(("fed back", ids.tolist()))
+            assert errors.shape == ids.shape
+            assert (errors >= 0).all()
+            super().feed_back(ids, errors)
+
+    trainer = small(
+        *(tmp_path,), num_envs=num_envs, phases=phases(160, Taped(0.5, 0.5)), capacity=400, learn_every=2, **NEVER
+    )
+    trainer.run()
+    drawn, back = ([ids for kind, ids in tape if kind == each] for each in ("drawn", "fed back"))
+    assert drawn == back
+    assert len(drawn) == trainer.learner.updates > 60
+    waiting = 0
+    for kind, _ in tape:  # with eight environments the updates of a step are drawn together
+        waiting += 1 if kind == "drawn" else -1
+        assert 0 <= waiting <= max(1, num_envs // 2)
+
+
+def test_a_checkpoint_with_scores_or_actions_that_cannot_be_is_refused(small: Small, tmp_path: Path) -> None:
+    trainer = small(tmp_path, phases=phases(40), **NEVER)
+    trainer.run()
+    state = trainer.state_dict()
+    trainer.load_state_dict(state)
+    for score in (np.inf, np.nan):
+        with pytest.raises(ValueError, match="scores are not finite"):
+            trainer.load_state_dict({**state, "scores": np.full_like(state["scores"], score)})
+    trainer.memory.add(0, len(trainer.emulators.game.actions), 0.0, trainer.stack.state[0, -1], False)
+    with pytest.raises(ValueError, match="holds action 4, which the game lacks"):
+        trainer.load_state_dict(state)
 
 
 @pytest.mark.parametrize(("num_envs", "few"), [(1, 37), (8, 7)])
