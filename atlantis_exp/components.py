@@ -99,6 +99,7 @@ class Plugin:
     sha256: str  # of the file, or of all of the package's
     shown: str  # as on the command line
     roots: tuple[Path, ...]  # the file, or the folders of its packages
+    text: bytes | None = None  # of the file
 
     def __str__(self) -> str:
         return describe(self.name, self.version, self.sha256)
@@ -287,8 +288,13 @@ def _check_game(cls: type[Any], settings: Sequence[Setting]) -> None:
     low, high = cls.score_range
     if not -math.inf < low < high < math.inf:
         raise TypeError(f"score_range: should be the lowest and the highest score, not ({low}, {high})")
-    if getattr(cls, "sources", ()) and not hasattr(cls, "points"):
-        raise TypeError("sources: need a static method points(reward, ram) that returns the points of each")
+    if getattr(cls, "sources", ()):
+        try:
+            inspect.signature(getattr(cls, "points", None)).bind("reward", "ram")  # type: ignore[arg-type]
+        except TypeError:
+            raise TypeError(
+                "sources: need a static method points(reward, ram) that returns the points of each"
+            ) from None
 
 
 def _is_plain(told: Any) -> bool:
@@ -383,7 +389,7 @@ def points_of(game: Component) -> Callable[[int, Any], Sequence[float]]:
     """Return the function that splits a frame's reward; worker processes can be sent it."""
     cls = game.load()
     points: Callable[[int, Any], Sequence[float]] = cls.points
-    text = vars(sys.modules[cls.__module__]).get("__text__")
+    text = game.plugin.text if game.plugin else None
     return points if text is None else partial(_points, game.path, text, cls.__name__)
 
 
@@ -444,7 +450,7 @@ def _plugin(reference: str) -> tuple[Plugin, list[Callable[[], ModuleType]]]:
         if not re.fullmatch(r"[A-Za-z_]\w{0,79}", path.stem, re.ASCII) or path.suffix != ".py":
             raise ConfigError(f"plugins={reference}: write a file NAME.py, its name of letters, digits and underscores")
         text = _read(reference, path)
-        plugin = Plugin(path.stem, None, hashlib.sha256(text).hexdigest(), reference, (path,))
+        plugin = Plugin(path.stem, None, hashlib.sha256(text).hexdigest(), reference, (path,), text)
         return plugin, [partial(_load, path, text)]
     try:
         package = distribution(reference)

@@ -1,5 +1,7 @@
 """The scripts that draw and keep what the documentation shows."""
 
+import ast
+import inspect
 import json
 import re
 import runpy
@@ -12,7 +14,9 @@ import pytest
 from PIL import Image
 
 from atlantis_exp.commands import VERBS
-from atlantis_exp.commands.helping import key_names
+from atlantis_exp.commands.helping import help_text, key_names
+from atlantis_exp.learning.objectives import Objective
+from atlantis_exp.replay.samplers import Sampler
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
@@ -179,6 +183,34 @@ def test_the_site_has_every_verb_and_every_key(site: Path) -> None:
 @pytest.mark.parametrize("path", SHORT, ids=lambda path: path.name)
 def test_a_page_is_short(path: Path) -> None:
     assert len(path.read_text().split()) <= (800 if path.name == "README.md" else 1_200)
+
+
+def test_extending_has_the_methods_of_a_sampler_and_of_an_objective_as_they_are() -> None:
+    (block,) = re.findall(r"```py\n(.*?)```", (DOCS / "extending.md").read_text(), re.DOTALL)
+    for shown, kind in zip(ast.parse(block).body, (Sampler, Objective), strict=True):
+        (own,) = ast.parse(inspect.getsource(kind)).body
+        methods = [
+            [
+                (each.name, ast.unparse(each.args), ast.unparse(each.returns or each))
+                for each in ast.walk(cls)
+                if isinstance(each, ast.FunctionDef)
+            ]
+            for cls in (shown, own)
+        ]
+        assert methods[0] == methods[1] != []
+
+
+def test_no_message_and_no_help_names_a_page_that_an_installed_package_lacks() -> None:
+    texts = [help_text(verb, ["all"]) for verb in VERBS]
+    for path in (REPOSITORY / "atlantis_exp").rglob("*.py"):
+        nodes = [*ast.walk(ast.parse(path.read_text()))]
+        docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        texts += [
+            node.value
+            for node in nodes
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings
+        ]
+    assert [text for text in texts if re.search(r"\b(docs|lab)/", text)] == []
 
 
 BANNED = re.compile(

@@ -158,7 +158,14 @@ class Mine:
             for text in ("(5.0, 2.0)", "(864.0,)", '("a", "b")', "(0.0, 1e999)")
         ),
         (GAME.format(name="pong") + "    keys = ('up', 'down')\n", "keys: should be a tuple[tuple[str, str], ...]"),
-        (GAME.format(name="pong") + "    sources = ('bricks',)\n", "sources: need a static method points(reward, ram)"),
+        *(
+            (GAME.format(name="pong") + f"    sources = ('bricks',)\n{method}", "sources: need a static method points(")
+            for method in (
+                "",
+                "    @staticmethod\n    def points(reward): ...\n",
+                "    def points(self, reward, ram): ...\n",
+            )
+        ),
         (GAME.format(name="pong") + "    def __init__(self, speed: int = 1): ...\n", "speed: a game has no settings"),
     ],
 )

@@ -284,6 +284,29 @@ def test_a_run_is_evaluated_exported_played_and_compared(
     assert len([*(plugins / "outputs" / "runs").iterdir()]) == 3
 
 
+def test_an_exported_network_is_handed_on_with_its_plugin_s_source_and_the_page_s_command_plays_it(
+    plugins: Path, command: Command, tiny_overrides: tuple[str, ...], said: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = replaced(tiny_overrides, "phase.quick.steps=30", "evaluation.at_end=false", "evaluation.every_steps=20")
+    words += ["plugins=[./mynet.py,parts.py]", *PARTS]
+    place = f"paths.outputs={plugins / 'outputs'}"
+    assert command(*words, place) == 0
+    export = ("export", "to=here/mine", "episodes=1", "evaluation.num_envs=1", "device=cpu", place)
+    assert command(*export, "plugins=./mynet.py,parts.py") == 0
+    (plugins / "mynet.py").unlink()
+    (plugins / "there").mkdir()
+    (plugins / "here").rename(plugins / "there" / "here")
+    monkeypatch.chdir(plugins / "there")
+    page = Path("here/mine/README.md").read_text()
+    assert f"`mynet.py`: the source of a plugin, sha256 `{sha256(NETWORK.encode()).hexdigest()}`" in page
+    shown = re.search(r"python -m atlantis_exp (evaluate .*) episodes=1", page)
+    assert shown is not None
+    played = [*shlex.split(shown[1]), "evaluation.video=false", "tracking=none", place]
+    assert command(*played) == 0
+    admit([])
+    assert "needs plugins=./mynet.py" in said(*(word for word in played if not word.startswith("plugins=")))
+
+
 @pytest.mark.usefixtures("packaged")
 def test_a_package_is_listed_and_named_without_being_imported(
     said: Said, command: Command, capsys: pytest.CaptureFixture[str]

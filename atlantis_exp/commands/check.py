@@ -20,8 +20,10 @@ _SMALL = (  # a training of seconds
     *("training.precision=fp32", "threads=1", "evaluation.at_end=false", "evaluation.every_episodes=null"),
     *("evaluation.every_steps=null", "tracking=none", "tracking.commit_episodes=2"),
 )
-_OURS = ("model=cnn", "model=resnet", "sampler=uniform", "objective=dqn")
-"""The components that others of their kinds are compared with."""
+_OURS = (  # that others of their kinds are compared with
+    *("model=cnn", "model=resnet", "sampler=uniform", "objective=dqn"),
+    *("epsilon=exponential", "lr_schedule=constant", "env=atlantis_standard"),
+)
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -38,14 +40,16 @@ def _work(asked: Asked[Config]) -> Callable[[], None]:
     job = job_of(replace(asked, overrides=overrides))
     chosen = [text for text in overrides if text.partition("=")[0] in KINDS]
     kinds = [text.partition("=")[0] for text in chosen] or [*KINDS]
-    measured = {}
-    if references := [text for text in _OURS if text.partition("=")[0] in kinds]:
-        measured["\n".join(chosen) or f"model={job.config.model.name}"] = job
-        for text in references:
-            kind = text.partition("=")[0]
-            own = [each for each in overrides if not each.startswith(kind)]
+    measured = {"\n".join(chosen) or f"model={job.config.model.name}": job}
+    for text in _OURS:
+        kind = text.partition("=")[0]
+        if kind in kinds:
+            prefix = "env=" if kind == "env" else kind  # settings of a game's protocol go with any game
+            own = [each for each in overrides if not each.startswith(prefix)]
             with suppress(ConfigError):  # other settings may not go with it
-                measured.setdefault(text, training_of([*own, text]))
+                ours = training_of([*own, text])
+                if all(ours.config.identity() != each.config.identity() for each in measured.values()):
+                    measured[text] = ours
     small = training_of(replaced([text for text in overrides if not text.startswith("phase")], *_SMALL))
     return partial(check, contracts_of(job.config, small, kinds), measured)
 

@@ -10,7 +10,7 @@ from atlantis_exp.terminal import PROGRAM
 _GROUP = re.compile(r" +- (?P<preset>override /)?(?P<group>[\w@.]+): (?P<option>\w+)\s*(?:#.*)?")
 _KEY = re.compile(r"(?P<indent> *)(?P<key>\w+):(?P<value>.*?)\s*(?:#(?P<comment>.*))?")
 _SHOWN = re.compile(r"  ([\w.]+)(?:=|\s|$)")  # a key as a help shows it
-_DAILY = ("model", "sampler", "env", "objective", "phase")  # groups shown first
+_DAILY = ("model", "experiment", "sampler", "env", "objective", "phase")  # groups shown first
 _VALUES = 30  # columns of a key and its value, behind which its sentence begins
 
 _SWEEP = """\
@@ -51,7 +51,7 @@ def help_text(verb: str, arguments: Sequence[str]) -> str:
             short.append(f"  {line}")
     parts = [f"{PROGRAM} {verb} KEY=VALUE ...\n{VERBS[verb]}"]
     parts += ["\n".join([title, *lines]) for title, lines in (("Keys:", keys), ("Groups:", short)) if lines]
-    parts += full
+    parts += sorted(full, key=lambda text: text.startswith("experiment="))  # a preset overrides the other groups
     return "\n\n".join([*parts, *_plugins(), f"Flags:\n{'' if verb in ('decide', 'search') else _SWEEP}{_FLAGS}"])
 
 
@@ -103,13 +103,13 @@ def _defaults(path: Path) -> list[str]:
 
 
 def _keys(path: Path, prefix: str) -> Iterator[str]:
-    """Yield a line for each key of a file: dotted key, value, sentence; first those of its base files."""
+    """Yield a line for each key of a file: dotted key, value, sentence; then those of its base files."""
     own = [*_own_keys(path, prefix)]
+    yield from own
     names = {match[1] for line in own if (match := _SHOWN.match(line))}
     for line in _defaults(path):
         if (base := path.parent / f"{line.strip(' -')}.yaml").is_file():
             yield from _without(names, _keys(base, prefix))
-    yield from own
 
 
 def _own_keys(path: Path, prefix: str) -> Iterator[str]:

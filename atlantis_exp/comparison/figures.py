@@ -214,7 +214,7 @@ def _finish(axes: "Axes", x: str, y: str = "", *, is_logarithmic: bool = False, 
         return
     renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
     for number in range(columns, 0, -1):
-        legend = figure.legend(loc="outside upper left", ncols=number, fontsize=7.5, columnspacing=1)
+        legend = figure.legend(loc="outside upper left", ncols=number, fontsize=9, columnspacing=1)
         extent = legend.get_window_extent(renderer)
         if extent.width <= figure.bbox.width or number == 1:
             figure.set_figheight(figure.get_figheight() + extent.height / figure.dpi)
@@ -231,7 +231,7 @@ def _reference_lines(draw_line: Callable[..., Any], comparison: Comparison, low:
         shown = [row for row in shown if row["name"] != "random player"]
     styles = ((0, (1, 1)), (0, (4, 2)), (0, (6, 2, 1, 2)), (0, (2, 3)))
     for index, row in enumerate(shown):
-        label = f"{row['name']}{', published' if 'published' in row['protocol'] else ''} (mean {row['score']:,.0f})"
+        label = f"{row['name']}{', published' if 'published' in row['protocol'] else ''} ({row['score']:,.0f})"
         draw_line(row["score"], color="#8c8c8c", linewidth=1, linestyle=styles[index % len(styles)], label=label)
 
 

@@ -1,6 +1,7 @@
 """Write a comparison as a page: one HTML file that needs no other; and say how its tables are shown."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from importlib.resources import files
 
 from jinja2 import Environment, StrictUndefined
@@ -20,7 +21,7 @@ def page(comparison: Comparison, figures: Mapping[str, Drawn], facts: Mapping[st
         figures=figures,
         facts=facts,
         shown_columns=shown_columns,
-        label=label,
+        label=partial(label, score=comparison.question.score),
         cells=cells,
     )
 
@@ -53,6 +54,7 @@ _TITLES = {
     ("views", "other"): "other",
     **{(table, "seeds"): "seeds each" for table in ("verdict", "looks")},
 }
+_SCORE = {"last": "IQM", "training": "training score"}  # of a seed, by the question's score
 _TITLE = {
     "family": "by",
     "other": "against",
@@ -91,8 +93,10 @@ _ENDS = {
 """The columns of a table that have an interval, and those of its ends."""
 
 
-def label(name: str, column: str) -> str:
-    """Return the title of a column."""
+def label(name: str, column: str, score: str = "") -> str:
+    """Return the title of a column; score: the question's, for columns of it."""
+    if column == "score" and name in ("scores", "runs"):
+        return _SCORE.get(score, column)
     return (
         _TITLES.get((name, column)) or _TITLE.get(column, column.replace("_", " "))
         if name in COLUMNS
@@ -146,8 +150,8 @@ def number(value: object, column: str = "") -> str:
     return f"{value:,.0f}" if abs(value) >= 10 or value == int(value) else f"{value:.3g}"
 
 
-def plain(name: str, table: Table) -> list[list[str]]:
-    """Return a shown table as texts, header first."""
+def plain(name: str, table: Table, score: str = "") -> list[list[str]]:
+    """Return a shown table as texts, header first; score: as in `label`."""
     columns = shown_columns(name, table)
-    header = [label(name, column) for column in columns]
+    header = [label(name, column, score) for column in columns]
     return [header, *([text for text, _ in cells(name, row, columns)] for row in table)]

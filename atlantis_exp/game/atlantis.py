@@ -29,7 +29,7 @@ class Atlantis:
     published_in_words = "above a million the time cap decides"
     held_score = 2_000.0
     early_frames = 10_000_000
-    early_scores = "at 5 M frames published DQN is at 7,000 to 9,000 (docs/comparison.md)"
+    early_scores = "at 5 M frames published DQN is at 7,000 to 9,000"
     keys = (("left", "LEFTFIRE"), ("right", "RIGHTFIRE"), ("up", "FIRE"), ("space", "FIRE"))
     keys_in_words = "left, up, right fire a gun each; a gun fires once a press"
 

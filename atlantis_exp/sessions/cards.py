@@ -15,6 +15,7 @@ from rich.table import Table
 
 from atlantis_exp.build import build_network_actor, described
 from atlantis_exp.checking import nearest, parse, to_dict
+from atlantis_exp.components import admitted
 from atlantis_exp.config import STRICT, Config, EvaluationConfig, PathsConfig
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.files import ARTIFACT, SMALL, read_file, read_object, write_file
@@ -70,7 +71,7 @@ def read_card(folder: Path) -> tuple[Card, bytes]:
 def write_card(
     folder: Path, shown: Path, card: Card, weights: bytes, evaluation: Evaluation, onnx: bytes | None = None
 ) -> None:
-    """Write weights, their card, and a page for people and model hubs into a folder, called `shown` on the page."""
+    """Write weights, their card, the plugins that are files, and a page, which calls the folder `shown`."""
     write_file(folder / "weights.safetensors", weights)
     files = f"`weights.safetensors`: {len(weights):,} bytes, {card.precision}, sha256 `{card.sha256}`."
     if onnx is not None:
@@ -80,7 +81,18 @@ def write_card(
             f"\n\n`network.onnx`: {len(onnx):,} bytes, float32: `states`, uint8 (batch, {env.stack}, {env.size}, "
             f"{env.size}), to `q_values`, float32 (batch, actions)."
         )
-    write_file(folder / "README.md", _page(shown, card, files, evaluation).encode())
+    place = shown if len(shown.parts) > 1 and not shown.is_absolute() else f"./{shown.name}"
+    play, references = f"python -m atlantis_exp evaluate weights={place}", list[str]()
+    hashes = {plugin.sha256 for plugin in card.config.plugins.values()}
+    for plugin in dict.fromkeys(each.plugin for each in admitted().values()):
+        if plugin and plugin.sha256 in hashes:
+            references.append(plugin.name if plugin.text is None else f"{place}/{plugin.name}.py")
+            if plugin.text is not None:
+                write_file(folder / f"{plugin.name}.py", plugin.text)
+                files += f"\n\n`{plugin.name}.py`: the source of a plugin, sha256 `{plugin.sha256}`."
+    if references:
+        play += f" plugins={','.join(references)}"
+    write_file(folder / "README.md", _page(shown.name, play, card, files, evaluation).encode())
     write_file(folder / "card.json", (json.dumps(to_dict(card), indent=2) + "\n").encode())
 
 
@@ -159,7 +171,7 @@ def metadata(name: str, card: Card) -> str:
     return "\n".join(["---", *(f"{key}: {json.dumps(value)}" for key, value in facts.items()), "---"])
 
 
-def _page(folder: Path, card: Card, files: str, evaluation: Evaluation) -> str:
+def _page(name: str, play: str, card: Card, files: str, evaluation: Evaluation) -> str:
     env = to_dict(card.config.env)
     del env["num_envs"], env["workers"]
     training = {
@@ -170,18 +182,17 @@ def _page(folder: Path, card: Card, files: str, evaluation: Evaluation) -> str:
         **({"plugins": described(card.config)} if card.config.plugins else {}),
         **card.made,
     }
-    place = folder if len(folder.parts) > 1 and not folder.is_absolute() else f"./{folder.name}"
     what = f"{card.config.model.name} with {card.config.objective.name}"
     learned = card.made.get("precision", "float32")
     otherwise = "" if learned == "float32" else f"; it learned in {learned}, in which it may choose otherwise"
-    return f"""{metadata(folder.name, card)}
+    return f"""{metadata(name, card)}
 
-# {folder.name}
+# {name}
 
 Weights of a network that plays Atari {card.config.env.title}: {what}.
 
-    python -m atlantis_exp evaluate weights={place}               # plays the episodes below
-    python -m atlantis_exp evaluate weights={place} episodes=1    # a first look
+    {play}               # plays the episodes below
+    {play} episodes=1    # a first look
 
 ## Scores
 
@@ -212,8 +223,8 @@ curve at or before the step.
 
 ## Licence
 
-That of this repository (MIT). The weights were learned from the game as ale-py emulates it; its ROM, which comes with
-ale-py under its own terms, is no part of them.
+That of this repository (MIT), except for the sources of plugins. The weights were learned from the game as ale-py
+emulates it. They do not contain its ROM, which comes with ale-py under its own terms.
 """.replace("    \n", "\n")
 
 

@@ -189,7 +189,7 @@ def _metrics(comparison: Comparison) -> dict[str, float]:
 def _print(comparison: Comparison) -> None:
     """Print the scores, what the answers rest on, and last the answers; all else is on the page."""
     console = terminal.console(least=160)
-    header, *rows = plain("scores", comparison.tables["scores"])
+    header, *rows = plain("scores", comparison.tables["scores"], comparison.question.score)
     table = Table(*header, title=f"scores by {', '.join(comparison.by)}")
     for column in table.columns[1:]:
         column.justify = "right"

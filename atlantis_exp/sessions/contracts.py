@@ -54,17 +54,17 @@ _HEADS: dict[str, Head] = {
 
 def check(contracts: Iterator[Contract], measured: Mapping[str, Job]) -> None:
     """Try every contract; if all are kept, measure the costs of trainings, by name. Raises: Fault otherwise."""
-    tried = list[documents.Trial]()
-    for part, contract, trial in contracts:
-        because = ""
-        try:
-            with terminal.working(f"{part}: {contract}"):
+    tried, wanted, now = list[documents.Trial](), [*contracts], ""
+    with terminal.working("checking", lambda: now):
+        for number, (part, contract, trial) in enumerate(wanted, 1):
+            now, because = f"contract {number} of {len(wanted)}: {part}: {contract}", ""
+            try:
                 trial()
-        except Exception as error:
-            kind = "" if isinstance(error, Fault) else f"{type(error).__name__}: "
-            because = kind + next((line for line in str(error).splitlines() if line.strip()), "")
-            because = because or "no reason given"
-        tried.append(documents.Trial(component=part, contract=contract, kept=not because, because=because))
+            except Exception as error:
+                kind = "" if isinstance(error, Fault) else f"{type(error).__name__}: "
+                because = kind + next((line for line in str(error).splitlines() if line.strip()), "")
+                because = because or "no reason given"
+            tried.append(documents.Trial(component=part, contract=contract, kept=not because, because=because))
     table = Table("component", "contract", "", "because")
     for each in tried:
         table.add_row(each.component, each.contract, "kept" if each.kept else "BROKEN", each.because)
@@ -72,8 +72,8 @@ def check(contracts: Iterator[Contract], measured: Mapping[str, Job]) -> None:
     broken = [f"{each.component}: {each.contract}" for each in tried if not each.kept]
     costs = list[documents.Cost]()
     if measured and not broken:
-        with terminal.working("measuring costs"):
-            costs = _costs(measured)
+        with terminal.working("measuring costs", lambda: f"{len(costs) + 1} of {len(measured)}"):
+            costs.extend(_cost(name, job) for name, job in measured.items())
         terminal.console(least=120).print(_table(costs))
     terminal.document(documents.Check(trials=tried, costs=costs).model_dump_json())
     if broken:
@@ -312,29 +312,24 @@ def fingerprints(config: Config, outputs: Path) -> dict[str, str]:
     return fingerprint(state, memory, folder.path)
 
 
-def _costs(jobs: Mapping[str, Job]) -> list[documents.Cost]:
-    """Measure trainings on this machine; an update includes the draw of its batch."""
-    costs = []
-    for name, job in jobs.items():
-        config = job.config
-        set_up_torch(config, config.device)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder)
-            trainer = build_trainer(config, job.machine.cores, path, Journal(path), Progress(terminal.console()))
-            with trainer.emulators:
-                speed = expected(trainer, config, Counters())
-        size, batch = config.env.size, config.training.batch_size
-        costs.append(
-            documents.Cost(
-                component=name,
-                pixels=size,
-                parameters=count_parameters(trainer.learner.network),
-                flops_per_sample=trainer.learner.update_flops((config.env.stack, size, size), batch) / batch,
-                updates_per_second=speed.updates_per_second,
-                steps_per_second=speed.steps_per_second,
-            )
-        )
-    return costs
+def _cost(name: str, job: Job) -> documents.Cost:
+    """Measure a training on this machine; an update includes the draw of its batch."""
+    config = job.config
+    set_up_torch(config, config.device)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder)
+        trainer = build_trainer(config, job.machine.cores, path, Journal(path), Progress(terminal.console()))
+        with trainer.emulators:
+            speed = expected(trainer, config, Counters())
+    size, batch = config.env.size, config.training.batch_size
+    return documents.Cost(
+        component=name,
+        pixels=size,
+        parameters=count_parameters(trainer.learner.network),
+        flops_per_sample=trainer.learner.update_flops((config.env.stack, size, size), batch) / batch,
+        updates_per_second=speed.updates_per_second,
+        steps_per_second=speed.steps_per_second,
+    )
 
 
 def _table(costs: Sequence[documents.Cost]) -> Table:

@@ -80,6 +80,7 @@ def forecast(trainer: Trainer, *, capacity: int, max_bytes: int, size: int, stac
     sampler = copy.deepcopy(plan.phases[0].sampler)
 
     def play() -> None:
+        plan.learning_rate(0.0, 0), plan.epsilon(0.0, 0)
         actions = rng.integers(len(emulators.game.actions), size=num_envs)
         steps = emulators.step(actions)
         for env in range(num_envs):

@@ -251,6 +251,8 @@ class Recorder:
             f"**{state}** at step {counters.steps:,}: {counters.episodes:,} episodes, {counters.frames:,} frames, "
             f"{self.learner.updates:,} updates, {counters.seconds / 3600:.2f} hours",
         ]
+        if state == "finished" and counters.episodes < 2:
+            lines.append("Too short for a curve of scores, which needs two ended episodes.")
         if reached:
             scores = " | ".join(f"{reached[f'evaluation/{point}']:,.0f}" for point in TABLE_COLUMNS)
             lines += [

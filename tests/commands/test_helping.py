@@ -91,4 +91,7 @@ def test_a_help_begins_with_what_people_change_most_and_fits_a_screen_or_two() -
     lines = help_text("train", []).splitlines()
     assert lines[4].startswith("  seed=0")
     assert lines[lines.index("Groups:") + 1].startswith("  model=cnn ")
+    assert lines[lines.index("Groups:") + 2].startswith("  experiment=none ")
     assert len(lines) < 50 < len(help_text("train", ["all"]).splitlines())
+    for verb, key in (("decide", "against"), ("search", "trials")):  # their own keys, ahead of the training's
+        assert help_text(verb, []).splitlines()[4].startswith(f"  {key}=")

@@ -295,11 +295,16 @@ def test_the_config_is_all_there(recorded: Recorded, tiny: Callable[..., Config]
     assert {f"evaluation.{key}" for key in config["evaluation"]} <= columns
 
 
-def test_the_example_of_the_page_runs(recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("points", [2, 1, 0])  # of a curve; none before the first episode ends
+def test_the_example_of_the_page_runs(
+    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, points: int
+) -> None:
+    curve = ((0, 0, 0, 1_000), (600, 0.5, 30, 2_000))[:points]
     for sampler in ("uniform", "top_half"):
         for seed in (0, 1):
             overrides = (f"phase.quick.sampler={sampler}", f"sampler={sampler}", f"seed={seed}")
-            path = recorded(*overrides, f"paths.outputs={tmp_path}/outputs", scores=(1_000.0, 2_000.0, 3_000.0 + seed))
+            scores = (1_000.0, 2_000.0, 3_000.0 + seed)
+            path = recorded(*overrides, f"paths.outputs={tmp_path}/outputs", scores=scores, curve=curve)
             tag(path, {"policy": "FIRE in 40.0% of the network's decisions"})
             result = json.loads((path / "result.json").read_text())
             (path / "result.json").write_text(json.dumps({**result, "counts": {"frames": 600}}))

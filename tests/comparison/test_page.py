@@ -5,8 +5,10 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from PIL import Image
 from atlantis_exp.comparison.choosing import group
 from atlantis_exp.comparison.figures import Drawn, draw
 from atlantis_exp.comparison.gather import gather
-from atlantis_exp.comparison.page import number, page
+from atlantis_exp.comparison.page import number, page, plain
 from atlantis_exp.comparison.tables import Comparison, compare
 from atlantis_exp.comparison.verdict import Question
 
@@ -105,6 +107,15 @@ def test_the_page_says_the_verdict_the_notes_and_every_shown_table(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("score", "title"), [("last", "IQM"), ("training", "training score"), ("given", "score")])
+def test_a_column_of_scores_says_which_they_are(comparison: Comparison, score: Any, title: str) -> None:
+    asked = replace(comparison, question=replace(comparison.question, score=score))
+    assert title in plain("scores", asked.tables["scores"], score)[0]
+    heads = re.findall("<thead>(.*?)</thead>", page(asked, {}, {}), re.DOTALL)
+    assert sum(f">{title}</th>" in head and ">seeds</th>" in head for head in heads) == 1  # of groups
+    assert sum(f">{title}</th>" in head and ">run</th>" in head for head in heads) == 1
+
+
 def test_scores_within_a_decade_are_marked_in_thousands(recorded: Recorded, tmp_path: Path) -> None:
     recorded(scores=(2_100.0, 5_200.0))
     gathered = gather(tmp_path)
@@ -158,6 +169,8 @@ def test_figures_are_pictures_of_something_and_take_on_the_pages_ink(figures: di
         assert "#24292f" not in figure.svg
         assert "cnn" in figure.svg
     assert "cnn 1,673" in figures["scores"].alt
+    # On a phone of 390 pixels a point of a figure is a pixel of the screen.
+    assert min(float(size) for size in re.findall(r"font-size: ([\d.]+)px", figures["learning_frames"].svg)) >= 9
 
 
 @pytest.mark.slow

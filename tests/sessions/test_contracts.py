@@ -2,14 +2,17 @@
 
 import re
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from atlantis_exp import terminal
+from atlantis_exp.commands import CHECKOUT
 from atlantis_exp.commands.app import Asked
-from atlantis_exp.commands.check import _work
+from atlantis_exp.commands.check import CheckConfig, _work
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.components import KINDS, admit
 from atlantis_exp.config import Config
@@ -136,18 +139,32 @@ def test_what_is_broken_is_said_before_anything_is_measured() -> None:
         check_contracts(iter([("model=mine", "learns", partial(int, "x"))]), not_measured)
 
 
+def test_how_many_contracts_are_left_is_said_while_one_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, said = list[Callable[[], str]](), list[str]()
+
+    def working(_: str, how_far: Callable[[], str]) -> AbstractContextManager[None]:
+        asked.append(how_far)
+        return nullcontext()
+
+    monkeypatch.setattr(terminal, "working", working)
+    check_contracts(iter([(part, "learns", lambda: said.append(asked[0]())) for part in ("mine", "all")]), {})
+    assert said == ["contract 1 of 2: mine: learns", "contract 2 of 2: all: learns"]
+
+
 @pytest.mark.parametrize(
     ("chosen", "tried", "measured"),
     [
         (("sampler=mine",), {"sampler=mine"}, ["sampler=mine", "sampler=uniform"]),
         (("objective=mine",), {"objective=mine"}, ["objective=mine", "objective=dqn"]),
         (("model=mine",), {"model=mine"}, ["model=mine", "model=cnn", "model=resnet"]),
-        (("epsilon=mine",), {"epsilon=mine"}, []),
+        (("epsilon=mine",), {"epsilon=mine"}, ["epsilon=mine", "epsilon=exponential"]),
+        (("env=pong",), {"env.id=ALE/Pong-v5"}, ["env=pong", "env=atlantis_standard"]),
         (
             ("model=mine", "lr_schedule=mine"),
             {"model=mine", "lr_schedule=mine"},
-            ["model=mine\nlr_schedule=mine", "model=cnn", "model=resnet"],
+            ["model=mine\nlr_schedule=mine", "model=cnn", "model=resnet", "lr_schedule=constant"],
         ),
+        (("model=cnn",), {"model=cnn"}, ["model=cnn", "model=resnet"]),
     ],
 )
 def test_components_that_are_named_are_tried_and_no_others(
@@ -155,11 +172,13 @@ def test_components_that_are_named_are_tried_and_no_others(
 ) -> None:
     (tmp_path / "mine.py").write_text(PARTS)
     words = [text for text in tiny_overrides if text.partition("=")[0] not in KINDS]
-    ((overrides, config),) = check("config", Config, [*words, f"plugins={tmp_path / 'mine.py'}", *chosen]).items()
+    plugins = f"plugins=[{tmp_path / 'mine.py'},{CHECKOUT / 'examples' / 'pong.py'}]"
+    ((overrides, config),) = check("check", CheckConfig, [*words, plugins, *chosen]).items()
     call: Any = _work(Asked(config, "check", overrides))
     contracts, jobs = call.args
     assert {part for part, *_ in contracts} == {*tried, "all"}
     assert [*jobs] == measured
+    assert {job.config.env.size for job in jobs.values()} == {40}
 
 
 def test_a_training_that_fails_amid_the_contracts_is_said_with_its_last_line(tmp_path: Path, tiny: Compose) -> None:

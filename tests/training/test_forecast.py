@@ -98,6 +98,31 @@ def test_a_real_training_is_none_the_wiser_of_forecasts_at_its_start_and_when_it
         )
 
 
+@pytest.mark.parametrize("schedule", ["epsilon", "learning_rate"])
+def test_a_step_is_measured_with_its_schedules(
+    small: Callable[..., Trainer], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, schedule: str
+) -> None:
+    trainer, calls = small(tmp_path), []
+
+    def counting(*_: float) -> float:
+        calls.append(schedule)
+        return 0.5
+
+    changed: dict[str, Any] = {schedule: counting}
+    trainer.plan = replace(trainer.plan, **changed)
+    during = []
+
+    def median_seconds(call: Callable[[], object], **_: float) -> float:
+        before = len(calls)
+        call()
+        during.append(len(calls) - before)
+        return 1e-3
+
+    monkeypatch.setattr(forecast_module, "_median_seconds", median_seconds)
+    expected_of(trainer, 8)
+    assert during == [1, 0, 0]  # to play, to act, to learn
+
+
 def test_what_is_left_is_expected_of_a_training(small: Callable[..., Trainer], tmp_path: Path) -> None:
     trainer = small(tmp_path, num_envs=2, epsilon=lambda *_: 0.5, learn_every=4, evaluate_steps=None)
     whole = expected_of(trainer, 8)

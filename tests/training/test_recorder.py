@@ -118,6 +118,17 @@ def test_the_description_says_how_the_run_stands_and_what_its_last_evaluation_wa
     assert f"The best mean so far is {recorder.best_mean:,.0f}, at step {recorder.best_step:,}." in notes()[-1]
 
 
+@pytest.mark.parametrize(("episode_steps", "short"), [(200, True), (100, True), (80, False)])  # of 160 steps
+def test_the_description_says_where_a_training_was_too_short_for_curves(
+    small: Small, tmp_path: Path, episode_steps: int, short: bool
+) -> None:
+    trainer = small(tmp_path, episode_steps=episode_steps)
+    trainer.run()
+    notes = [record.values[NOTE] for _, record in read(tmp_path) if isinstance(record, Tags) and NOTE in record.values]
+    said = ["Too short for a curve of scores" in note for note in notes]
+    assert said == [False] * (len(notes) - 1) + [short]
+
+
 def test_every_number_of_an_evaluation_is_said_at_one_step_and_the_last_ones_is_where_the_run_ended(
     small: Small, tmp_path: Path
 ) -> None:
