@@ -245,26 +245,6 @@ def moved_seeds(facts: Facts) -> Iterator[str]:
             )
 
 
-def in_training(facts: Facts) -> Iterator[str]:
-    """Name the group that leads in each view, if the intervals of its differences leave out zero."""
-    outcomes: dict[str, list[str]] = defaultdict(list)
-    views = facts.tables["views"]
-    shown = dict.fromkeys(row["view"] for row in views)
-    for view in shown:
-        rows = [row for row in views if row["view"] == view]
-        if all(row["low"] > 0 for row in rows):
-            outcomes[f"{rows[0]['leader']} leads at {{}}"].append(view)
-        elif any(row["low"] <= 0 for row in rows):
-            outcomes["no lead is clear at {}, where an interval includes zero"].append(view)
-        else:
-            outcomes["nothing can be said of {}, for want of seeds"].append(view)
-    if len(facts.groups) > 1 and (missing := [view for view in AXES.values() if view not in shown]):
-        outcomes["nothing is known of {}, since a run has no such curve or too short a one"] = missing
-    if outcomes:
-        said = "; ".join(text.format(" and ".join(at)) for text, at in outcomes.items())
-        yield f"In training, {said}: descriptions, not verdicts."
-
-
 def mixed(facts: Facts) -> Iterator[str]:
     """Name differences within a group, and between groups beyond the question."""
     varied = {label: _differing([run.science for run in runs]) for label, runs in facts.groups.items()}
@@ -358,7 +338,7 @@ CAVEATS: Sequence[Note] = (
 )
 """What may make a verdict mean something else."""
 
-NOTES: Sequence[Note] = (in_training, equal_shares, mixed, begun, survival_and_rate, time_cap, other_players)
+NOTES: Sequence[Note] = (equal_shares, mixed, begun, survival_and_rate, time_cap, other_players)
 """What is said after it."""
 
 
