@@ -16,12 +16,10 @@ import pandas as pd
 import pytest
 
 from atlantis_exp import load_runs
-from atlantis_exp.checking import to_dict
 from atlantis_exp.comparison.estimands import score_of
 from atlantis_exp.comparison.export_tables import UNITS
 from atlantis_exp.comparison.gather import gather
 from atlantis_exp.components import facts_of, game_of
-from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal
@@ -285,14 +283,6 @@ def test_every_frame_survives_parquet(recorded: Recorded, tmp_path: Path) -> Non
         frame = getattr(loaded, name)
         frame.to_parquet(tmp_path / f"{name}.parquet")
         pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / f"{name}.parquet"), frame, check_dtype=False)
-
-
-def test_the_config_is_all_there(recorded: Recorded, tiny: Callable[..., Config], tmp_path: Path) -> None:
-    recorded("seed=3")
-    columns = set(load_runs(tmp_path).runs.columns)
-    config = to_dict(tiny("seed=3"))
-    assert {f"training.{key}" for key in config["training"]} <= columns
-    assert {f"evaluation.{key}" for key in config["evaluation"]} <= columns
 
 
 def test_the_example_of_the_page_runs(recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -148,11 +148,6 @@ def the_folder(outputs: Path) -> Path:
     return folder
 
 
-def rows(folder: Path, table: str) -> list[dict[str, str]]:
-    with open(folder / "artifacts" / "tables" / f"{table}.csv") as file:
-        return list(csv.DictReader(file))
-
-
 # What is asked, and the one quantity that is decided.
 
 
@@ -350,18 +345,6 @@ def test_a_look_that_nobody_planned_is_charged_and_said() -> None:
     assert each.decision.looks[1].error == pytest.approx(charged)
     assert spent(each) == "looks planned at 5 and 10 seeds; taken: 5, 7; error spent: 2.45% of 5.00%"
     assert comparison.tables["plan"][0]["taken"] == "5 7"
-
-
-def test_a_planned_look_that_is_late_is_charged_for_the_seeds_it_has() -> None:
-    runs = [*around("cnn", 3_000.0, range(7)), *around("resnet", 3_015.0, range(7))]
-    (each,) = compared(runs).answers
-    assert spent(each) == "looks planned at 5 and 10 seeds; taken: 7; error spent: 2.45% of 5.00%"
-
-
-def test_pairs_that_a_look_leaves_open_have_the_next_one_at_once_where_their_seeds_are_there() -> None:
-    runs = [*around("cnn", 3_000.0, range(10)), *around("resnet", 3_015.0, range(10)), *around("tiny", 9_000.0)]
-    (each,) = compared(runs).answers
-    assert [(look.size, len(look.verdicts)) for look in each.decision.looks] == [(5, 3), (10, 1)]
 
 
 def test_what_would_have_been_found_is_not_said_of_seeds_that_do_not_differ() -> None:
@@ -605,37 +588,6 @@ def test_who_leads_while_training_is_described() -> None:
 
 
 # The verb.
-
-
-@pytest.mark.usefixtures("_undrawn")
-@pytest.mark.slow
-def test_the_same_question_of_more_seeds_is_the_same_comparison_and_remembers_its_looks(
-    record_seeds: Callable[..., list[Path]], run: Run, tmp_path: Path
-) -> None:
-    for model, score in (("cnn", 3_000.0), ("resnet", 3_015.0)):
-        record_seeds(model, score, policy="collapsed: FIRE in 99.9% of the network's decisions")
-    shown = run()
-    assert "next look at 10 seeds (there are 5 each)" in shown
-    assert "5 of 5 runs of cnn collapsed to one action" in shown
-    kept = (the_folder(tmp_path) / "looks.json").read_bytes()
-    assert "taken: 5; error spent: 1.25% of 5.00%" in run()
-    assert (the_folder(tmp_path) / "looks.json").read_bytes() == kept
-    for model, score in (("cnn", 3_000.0), ("resnet", 3_015.0)):
-        record_seeds(model, score, range(5, 10))
-    shown = run()
-    assert "taken: 5, 10; error spent: 5.00% of 5.00%" in shown
-    assert "would have been found with 80 %." in shown
-    assert [row["look"] for row in rows(the_folder(tmp_path), "looks")] == ["1", "2"]
-
-    with RunFolder(the_folder(tmp_path)).held():
-        assert " is held by process " in run(code=75)
-    path = the_folder(tmp_path) / "looks.json"
-    whole = path.read_text()
-    path.write_text(whole[:-20])
-    assert run(code=1).startswith(f"atlantis_exp: {path} is not a record of this comparison's looks (")
-    path.write_text(whole)
-    run("delta=5%")
-    assert len(list((tmp_path / "comparisons").iterdir())) == 2
 
 
 @pytest.mark.usefixtures("_undrawn")

@@ -248,14 +248,6 @@ def test_what_make_raises_is_raised() -> None:
         ProcessEmulators(functools.partial(make, max_pool=True, frameskip=1), 2, 2)
 
 
-def test_workers_leave_signals_to_the_parent(two_workers: ProcessEmulators) -> None:
-    two_workers.reset(range(NUM_ENVS))
-    for number in SIGNALS:
-        for pid in workers_of_this_process():
-            os.kill(pid, number)
-        two_workers.step([0] * NUM_ENVS)
-
-
 def test_workers_leave_signals_to_the_parent_from_their_start_on() -> None:
     before = workers_of_this_process()
     with ProcessEmulators(make, NUM_ENVS, workers=2) as emulators:

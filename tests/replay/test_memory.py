@@ -272,18 +272,6 @@ def test_no_transition_aliases_the_observations_it_came_from_nor_the_batch_it_we
     assert s_tp1[:, :, 0, 0].tolist() == [[0, 0, 0, 1], [0, 0, 1, 2], [0, 1, 2, 3], [1, 2, 3, 4], [2, 3, 4, 5]]
 
 
-def test_the_last_observation_of_an_episode_is_a_next_state_but_never_a_state() -> None:
-    memory = memory_of(20)
-    blank = np.zeros(SHAPE, np.uint8)
-    for terminal in (True, False):
-        memory.begin(0, blank)
-        memory.add(0, 0, 0.0, blank, False)
-        memory.add(0, 0, 0.0, blank, terminal)
-    memory.begin(0, blank)
-    assert available_ids(memory).tolist() == [0, 1, 3, 4]
-    assert (memory.gather(np.array([0, 1, 3, 4]), ONE_STEP).discount == 0).tolist() == [False, True, False, False]
-
-
 def test_a_return_ends_with_its_episode_and_is_short_where_the_episode_has_come_no_further() -> None:
     memory = memory_of(40)
     blank = np.zeros(SHAPE, np.uint8)

@@ -4,8 +4,6 @@ import csv
 import dataclasses
 import signal
 import sqlite3
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -20,14 +18,13 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import NOTE, Artifact, Journal, Tags, read_commit
-from atlantis_exp.sessions.job import Job, fitted, replaced
+from atlantis_exp.sessions.job import Job, fitted
 from atlantis_exp.sessions.launchers import Launcher
 from atlantis_exp.sessions.sweep import _every, ledger
 from atlantis_exp.sessions.training import train
 from atlantis_exp.tracking.publishing import catch_up
 
 Compose = Callable[..., Config]
-REPOSITORY = Path(__file__).parents[2]
 ELSEWHERE = Launcher("elsewhere")  # none that needs a library
 SHORT = ("tracking=mlflow", "tracking.every_steps=20", "phase.quick.steps=80", "evaluation.every_steps=null")
 
@@ -202,35 +199,6 @@ def test_why_a_run_failed_takes_no_hold_of_the_terminal(
     with ledger([Job(tiny())]):
         pass
     assert ": no ]52;c;cm0=device\n" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_runs_trained_by_processes_of_their_own_have_one_parent_and_a_repeated_sweep_the_same(
-    pair: list[Job], tiny_overrides: tuple[str, ...]
-) -> None:
-    outputs = pair[0].outputs
-    with ledger(pair, ["seed=0,1"]):
-        command = (sys.executable, "-m", "atlantis_exp", *replaced(tiny_overrides, *SHORT, f"paths.outputs={outputs}"))
-        processes = [
-            subprocess.Popen((*command, f"seed={job.config.seed}"), cwd=REPOSITORY, stdout=subprocess.DEVNULL)
-            for job in pair
-        ]
-        assert [process.wait() for process in processes] == [0, 0]
-    sweeps = rows(outputs, "SELECT run_uuid, status FROM runs WHERE name = 'sweep seed=0,1'")
-    assert sweeps == [(sweeps[0][0], "FINISHED")]
-    children = tags(outputs, "mlflow.parentRunId")
-    assert len(children) == 2
-    assert set(children.values()) == {sweeps[0][0]}
-    note = tags(outputs, "mlflow.note.content")["sweep seed=0,1"]
-    assert all(f"| {name} | done | 80 |" in note for name in children)
-    page = next((outputs / "sweeps").glob("sweep-*")) / "artifacts"
-    table = list(csv.DictReader((page / "runs.csv").open()))
-    assert {line["run"] for line in table} == {job.config.run_name() for job in pair}
-
-    with ledger(pair, ["seed=0,1"]):
-        for job in pair:
-            train(job)
-    assert rows(outputs, "SELECT run_uuid, status FROM runs WHERE name = 'sweep seed=0,1'") == sweeps
 
 
 @pytest.mark.slow

@@ -125,27 +125,21 @@ def test_the_same_seed_gives_the_same_training_and_another_seed_another(small: S
     "overrides",
     [
         ("model=cnn", "env.num_envs=1"),
-        pytest.param(("model=cnn", "env.num_envs=3", "env.workers=2", "objective=double_dqn"), marks=pytest.mark.slow),
-        pytest.param(
-            ("model=resnet", "env.size=16", "env.num_envs=1", "optimizer=rmsprop", "objective.target.mode=train"),
-            marks=pytest.mark.slow,
-        ),
         pytest.param(
             (
-                *("env.num_envs=3", "env.workers=2", "sampler=prioritized"),
+                *("model=resnet", "env.size=16", "env.num_envs=3", "env.workers=2", "optimizer=rmsprop"),
+                *("objective.target.mode=train", "objective=double_dqn", "sampler=prioritized"),
                 *("phase.quick.sampler=prioritized", "phase.second.sampler=prioritized"),
             ),
             marks=pytest.mark.slow,
         ),
         pytest.param(
             (
-                *("objective=quantile", "lr_schedule=one_cycle", "objective.n_step=3"),
-                *("objective.target.tau=1", "objective.target.every=3"),
+                *("env=atlantis_standard", "env.size=40", "env.num_envs=8", "objective=quantile"),
+                *("lr_schedule=one_cycle", "objective.n_step=3", "objective.target.tau=1", "objective.target.every=3"),
             ),
             marks=pytest.mark.slow,
         ),
-        pytest.param(("model=resnet", "env.size=16", "env.num_envs=8", "env.workers=2"), marks=pytest.mark.slow),
-        pytest.param(("model=cnn", "env.num_envs=8", "env=atlantis_standard", "env.size=40"), marks=pytest.mark.slow),
         pytest.param(
             ("model=cnn", "env.num_envs=3", "env.workers=2", "compile=true"),
             marks=[pytest.mark.slow, pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs it")],
