@@ -153,10 +153,10 @@ def compare(
 
 
 def to_csv(table: Table) -> str:
-    """Write a table with its keys as header; an empty one is an empty text."""
+    """Write a table with the keys of its rows as header; an empty one is an empty text."""
     text = io.StringIO()
     if table:
-        writer = csv.DictWriter(text, table[0].keys(), lineterminator="\n")
+        writer = csv.DictWriter(text, dict.fromkeys(key for row in table for key in row), lineterminator="\n")
         writer.writeheader()
         writer.writerows(table)
     return text.getvalue()

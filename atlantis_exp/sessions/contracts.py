@@ -20,7 +20,7 @@ from rich.table import Table
 from torch import nn
 
 from atlantis_exp import documents, terminal
-from atlantis_exp.build import build_component, build_memory, build_trainer, import_components, make_emulator
+from atlantis_exp.build import build_component, build_memory, import_components, make_emulator
 from atlantis_exp.config import ComponentConfig, Config
 from atlantis_exp.faults import Fault
 from atlantis_exp.learning.learner import Learner
@@ -30,14 +30,10 @@ from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
 from atlantis_exp.networks.sizes import count_parameters
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job, replaced
-from atlantis_exp.sessions.processor import set_up_torch
-from atlantis_exp.sessions.training import expected
+from atlantis_exp.sessions.training import measured
 from atlantis_exp.training.checkpoint import Checkpoints, to_safetensors
 from atlantis_exp.training.fingerprint import fingerprint
-from atlantis_exp.training.plan import Counters
-from atlantis_exp.training.progress import Progress
 
 Contract = tuple[str, str, Callable[[], object]]
 """A component, its contract, and a call that raises if the contract is broken."""
@@ -316,13 +312,8 @@ def _costs(jobs: Mapping[str, Job]) -> list[documents.Cost]:
     """Measure trainings on this machine; an update includes the draw of its batch."""
     costs = []
     for name, job in jobs.items():
+        trainer, speed = measured(job)
         config = job.config
-        set_up_torch(config, config.device)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder)
-            trainer = build_trainer(config, job.machine.cores, path, Journal(path), Progress(terminal.console()))
-            with trainer.emulators:
-                speed = expected(trainer, config, Counters())
         size, batch = config.env.size, config.training.batch_size
         costs.append(
             documents.Cost(

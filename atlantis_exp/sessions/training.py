@@ -2,6 +2,7 @@
 
 import dataclasses
 import signal
+import tempfile
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rich.console import Console
 
 from atlantis_exp import terminal
 from atlantis_exp.build import build_trained_network, build_trainer, choose_device, described, import_components
@@ -18,7 +20,7 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault, RunFault, in_words
 from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import CONFIG, LOST, TRACEBACK, Result, RunFolder, all_runs
-from atlantis_exp.runs.journal import Journal, adopt, has_lost_commit
+from atlantis_exp.runs.journal import Journal, Tracker, adopt, has_lost_commit
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.cards import read_card
 from atlantis_exp.sessions.job import Job, command_line, labels, replaced
@@ -204,7 +206,18 @@ def _begin_with(job: Job, folder: RunFolder) -> str:
     return f"To begin a training with its weights:\n  {export}\n  {begin}"
 
 
-def expected(trainer: Trainer, config: Config, done: Counters) -> Forecast:
+def measured(job: Job, cores: int | None = None) -> tuple[Trainer, Forecast]:
+    """Return a training that is not begun, and its cost here with so many cores; None: with this process's."""
+    config = dataclasses.replace(job.config, threads=job.config.threads or cores)
+    set_up_torch(config, config.device)
+    with tempfile.TemporaryDirectory() as aside:
+        progress = Progress(Console(quiet=True))
+        trainer = build_trainer(config, cores or job.machine.cores, Path(aside), Tracker(), progress)
+        with trainer.emulators:
+            return trainer, _expected(trainer, config, Counters())
+
+
+def _expected(trainer: Trainer, config: Config, done: Counters) -> Forecast:
     """Return the cost of the rest of a training here, and leave its parts as they are."""
     return forecast(
         trainer,
@@ -218,7 +231,7 @@ def expected(trainer: Trainer, config: Config, done: Counters) -> Forecast:
 
 def _check_forecast(trainer: Trainer, config: Config, done: Counters, progress: Progress) -> None:
     with terminal.working("measuring how fast it goes here"):
-        cost = expected(trainer, config, done)
+        cost = _expected(trainer, config, done)
     progress.say(str(cost))
     if cost.shortage is not None:
         if config.budget.forecast == "refuse":
