@@ -332,13 +332,6 @@ def test_the_package_is_imported_without_pandas() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_a_name_that_the_package_does_not_have_is_an_error() -> None:
-    import atlantis_exp
-
-    with pytest.raises(AttributeError, match="no attribute 'load_run'"):
-        atlantis_exp.load_run  # noqa: B018
-
-
 def test_the_score_of_a_run_is_that_of_its_comparison(recorded: Recorded, tmp_path: Path) -> None:
     recorded()
     for name in ("cnn-uniform-s0-82f1fe3874", "cnn-uniform-s1-e6500989ab"):

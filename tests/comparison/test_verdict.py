@@ -20,7 +20,7 @@ from atlantis_exp.comparison.account import Account
 from atlantis_exp.comparison.choosing import PROTOCOL, group
 from atlantis_exp.comparison.decision import Look, mean_interval
 from atlantis_exp.comparison.figures import draw
-from atlantis_exp.comparison.gather import Gathered, StoredRun, Training, gather
+from atlantis_exp.comparison.gather import Gathered, StoredRun, Training
 from atlantis_exp.comparison.page import page, plain
 from atlantis_exp.comparison.tables import Comparison, compare, to_csv
 from atlantis_exp.comparison.verdict import Group, Question, answer, families, group_of, wanted, worse_than_baseline
@@ -361,11 +361,6 @@ def test_a_difference_within_delta_is_a_verdict_too() -> None:
     assert compared(runs, delta=200.0).tables["verdict"][0]["said"] == "equivalent"
     assert "larger than 200 points" in compared(runs, delta=200.0).verdict
     assert compared(runs, delta=1.0).tables["verdict"][0]["said"] == "not decided"
-
-
-def test_scores_that_are_no_numbers_are_left_out(recorded: Recorded, tmp_path: Path) -> None:
-    folder = recorded(scores=(1_000.0, float("nan")))
-    assert "it has numbers beyond 1e15" in gather(tmp_path).skipped[folder.name]
 
 
 def test_the_seeds_that_the_next_look_wants_are_named_group_by_group() -> None:

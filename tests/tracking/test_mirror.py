@@ -182,23 +182,6 @@ def test_points_of_one_millisecond_survive_a_break_between_their_batches(
     assert points(root, tmp_path) == journaled_points(tmp_path)
 
 
-def test_a_resumed_run_shows_the_steps_it_redid_once(tmp_path: Path, root: Path, store: Store) -> None:
-    journal = Journal(tmp_path)
-    for step in range(5):
-        journal.metrics({"score": step}, step)
-    state = commit(journal)
-    journal.metrics({"score": 99}, 5)
-    journal.state_dict()  # killed before its checkpoint
-    publish(tmp_path, store)
-    resumed = Journal(tmp_path)
-    resumed.load_state_dict(state)
-    for step in range(5, 8):
-        resumed.metrics({"score": step}, step)
-    commit(resumed)
-    publish(tmp_path, store)
-    assert [(step, value) for _, step, _, value in points(root, tmp_path)] == [(step, step) for step in range(8)]
-
-
 def test_a_run_that_goes_back_behind_what_was_published_replaces_it(tmp_path: Path, root: Path, store: Store) -> None:
     class Broken(Store):
         def open_run(self, *_: Any) -> NoReturn:
