@@ -98,8 +98,7 @@ def read_account(
 ) -> Account:
     """Return the account of a question, read from all comparisons next to its folder.
 
-    Raises:
-        Fault: if the folder's own looks are damaged or gone.
+    Raises: Fault if the folder's own looks are damaged or gone.
     """
     others, damaged = [], []
     for path in sorted(folder.path.parent.glob(f"*/{LOOKS}")):

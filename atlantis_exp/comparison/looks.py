@@ -23,11 +23,9 @@ Record = dict[str, list[Look]]
 def read_looks(folder: Path, families: Sequence[Family], continued: Collection[str] = ()) -> Record:
     """Read the looks taken at some families; empty before the first.
 
-    Args:
-        continued: families that may have looks of an earlier question with another plan.
+    continued: families that may have looks of an earlier question with another plan.
 
-    Raises:
-        Fault: if no comparison of these families can have written the file, or a comparison that was made lacks it.
+    Raises: Fault if no comparison of these families can have written the file, or a comparison that was made lacks it.
     """
     path = folder / LOOKS
     if not path.exists():

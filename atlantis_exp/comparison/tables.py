@@ -91,12 +91,10 @@ def compare(
 ) -> Comparison:
     """Compare groups of trainings, taking the looks that are due, or with `now` one that is not.
 
-    Args:
-        account: the looks taken before, and the error that is left.
-        scored: the groups with the scores of their seeds; by default those of the trainings.
+    account: the looks taken before, and the error that is left.
+    scored: the groups with the scores of their seeds; by default those of the trainings.
 
-    Raises:
-        ConfigError: if the baseline is not among what is compared.
+    Raises: ConfigError if the baseline is not among what is compared.
     """
     account = account or Account()
     seeds_of = scored or [group_of(runs, question.by) for runs in groups.values()]

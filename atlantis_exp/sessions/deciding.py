@@ -50,9 +50,8 @@ class Contest:
         job_of: the training that overrides make.
         command: what continues it.
 
-    Raises:
-        ConfigError: two contenders are the same training, their scores would not mean the same, a run was trained for
-            longer, or the baseline is none of them.
+    Raises: ConfigError if two contenders are the same training, their scores would not mean the same, a run was trained
+    for longer, or the baseline is none of them.
     """
 
     def __init__(
@@ -213,8 +212,7 @@ def decide(contest: Contest, trained: Callable[[Job], int | None] | None = None)
 
     trained: trains a job in this process, one after the other; None: the contest's launcher does.
 
-    Raises:
-        Fault: a training fails; the same command goes on.
+    Raises: Fault if a training fails; the same command goes on.
     """
     tracking = contest.config.tracking
     again = f"the decision goes on with: {contest.command}"

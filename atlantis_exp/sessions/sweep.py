@@ -46,8 +46,7 @@ def sweep(
         on_a_node: trains a job of these overrides in a process of Slurm's.
         train: trains a job in this process.
 
-    Raises:
-        Fault: another process runs the same sweep, or a training failed, once all have ended.
+    Raises: Fault if another process runs the same sweep, or a training failed, once all have ended.
     """
     with ledger(jobs, swept, launcher, command):
         match launcher.name:
