@@ -1,7 +1,6 @@
 """Say what a reader must know before believing a comparison: a function a subject, which yields its lines or none."""
 
 import json
-import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,7 +27,6 @@ from atlantis_exp.components import Component, facts_of
 from atlantis_exp.runs.folder import LOST
 from atlantis_exp.terminal import PROGRAM
 
-_LENGTH = re.compile(r"phase\.\d+\.(episodes|steps)")
 _SHARES = {"frames": "{:,.0f} frames", "hours": "{:.2f} hours", "flops": "{:.3g} FLOPs"}  # by axis
 
 
@@ -263,23 +261,17 @@ def mixed(facts: Facts) -> Iterator[str]:
         yield f"The groups also differ in {_values(between)}."
 
 
-def equal_shares(facts: Facts) -> Iterator[str]:
-    """Say whether all runs were trained for equal steps, episodes or arithmetic, and what a run took of the others."""
-    if not (runs := facts.trainings):
+def shares(facts: Facts) -> Iterator[str]:
+    """Say which limit ended all runs, and what a run took on average."""
+    ended = {*map(_ended_by, facts.trainings)}
+    if len(ended) != 1 or len(facts.groups) < 2:
         return
-    (ended, *others) = dict.fromkeys(map(_ended_by, runs))
-    phases = {tuple((key, run.science[key]) for key in sorted(run.science) if _LENGTH.fullmatch(key)) for run in runs}
-    if others or len(facts.groups) < 2 or (ended == "the whole plan" and len(phases) > 1):
-        return
-    share = "arithmetic" if "budget.flops" in ended else "steps"
-    if "budget" not in ended and any(key.endswith("episodes") and value for key, value in phases.pop()):
-        share = "episodes"
     took = []
     for label, trained in facts.groups.items():
         ends = {axis: [run.curve[axis][-1] for run in trained if axis in run.curve] for axis in AXES}
         each = [_SHARES[axis].format(fmean(values)) for axis, values in ends.items() if values]
         took.append(f"{label} {', '.join(each)}")
-    yield f"The runs were trained for equal {share} ({ended}). On average a run took: {'; '.join(took)}."
+    yield f"All runs were trained for {ended.pop()}. On average a run took: {'; '.join(took)}."
 
 
 def begun(facts: Facts) -> Iterator[str]:
@@ -338,7 +330,7 @@ CAVEATS: Sequence[Note] = (
 )
 """What may make a verdict mean something else."""
 
-NOTES: Sequence[Note] = (equal_shares, mixed, begun, survival_and_rate, time_cap, other_players)
+NOTES: Sequence[Note] = (shares, mixed, begun, survival_and_rate, time_cap, other_players)
 """What is said after it."""
 
 

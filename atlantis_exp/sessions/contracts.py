@@ -31,7 +31,7 @@ from atlantis_exp.networks.sizes import count_parameters
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.sessions.job import Job, replaced
-from atlantis_exp.sessions.training import measured
+from atlantis_exp.sessions.training import measure
 from atlantis_exp.training.checkpoint import Checkpoints, to_safetensors
 from atlantis_exp.training.fingerprint import fingerprint
 
@@ -68,8 +68,7 @@ def check(contracts: Iterator[Contract], measured: Mapping[str, Job]) -> None:
     broken = [f"{each.component}: {each.contract}" for each in tried if not each.kept]
     costs = list[documents.Cost]()
     if measured and not broken:
-        with terminal.working("measuring costs"):
-            costs = _costs(measured)
+        costs = _costs(measured)
         terminal.console(least=120).print(_table(costs))
     terminal.document(documents.Check(trials=tried, costs=costs).model_dump_json())
     if broken:
@@ -312,7 +311,7 @@ def _costs(jobs: Mapping[str, Job]) -> list[documents.Cost]:
     """Measure trainings on this machine; an update includes the draw of its batch."""
     costs = []
     for name, job in jobs.items():
-        trainer, speed = measured(job)
+        trainer, speed = measure(job)
         config = job.config
         size, batch = config.env.size, config.training.batch_size
         costs.append(

@@ -32,8 +32,8 @@ from atlantis_exp.sessions.job import Job, command_line, labels, quoted, replace
 from atlantis_exp.sessions.launchers import BASIC, Launcher
 from atlantis_exp.sessions.launchers.joblib import fitting
 from atlantis_exp.sessions.page import opened, terminable
-from atlantis_exp.sessions.sweep import hours_of, how_many, sweep
-from atlantis_exp.sessions.training import train
+from atlantis_exp.sessions.sweep import how_many, sweep
+from atlantis_exp.sessions.training import measure, train
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.training.forecast import duration
 
@@ -273,7 +273,7 @@ def say_what_it_takes(contest: Contest) -> None:
         say(how_many(launcher))
     for label, runs in missing.items():
         if runs and contest.config.budget.forecast != "off":
-            forecast = hours_of(contest.job(label, 0), cores)
+            forecast = measure(contest.job(label, 0), cores)[1].hours
             hours += runs * forecast
             say(f"{label}: {duration(forecast)} a run, {'on its share' if cores else 'alone on this machine'}")
     if hours:

@@ -20,7 +20,7 @@ from atlantis_exp.sessions.launchers import BASIC, Launcher, in_turn
 from atlantis_exp.sessions.launchers.joblib import train_side_by_side
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.page import ending, opened, terminable
-from atlantis_exp.sessions.training import measured, train
+from atlantis_exp.sessions.training import measure, train
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.training.forecast import duration
 
@@ -88,7 +88,7 @@ def say_hours(jobs: Sequence[Job], launcher: Launcher) -> None:
     at_once = min(launcher.settings.get("n_jobs", 1), len(left))
     hours = ""
     if left[0].config.budget.forecast != "off":
-        each = hours_of(left[0], launcher.settings.get("cores"))
+        each = measure(left[0], launcher.settings.get("cores"))[1].hours
         hours = f": about {duration(each * ceil(len(left) / at_once))} if all take as long as {left[0].title}"
     print(f"{how_many(launcher)}{hours}", flush=True)
 
@@ -99,12 +99,6 @@ def how_many(launcher: Launcher) -> str:
         return "one training after the other"
     cores = launcher.settings["cores"]
     return f"{launcher.settings['n_jobs']} trainings at a time, {cores} {'core' if cores == 1 else 'cores'} each"
-
-
-def hours_of(job: Job, cores: int | None = None) -> float:
-    """Return the hours that a training takes here with so many cores; None: with this process's."""
-    with terminal.working("measuring how fast it goes here"):
-        return measured(job, cores)[1].hours
 
 
 def _print_table(runs: Runs) -> None:
