@@ -125,14 +125,6 @@ def test_saved_emulators_play_on_under_any_number_of_workers(emulators: Emulator
         assert_all_equal(play(restored, 100, seed=3), played)
 
 
-def test_a_step_can_be_sent_and_received_later(emulators: Emulators) -> None:
-    state = emulators.state_dict()
-    emulators.send([1, 2], [2, 0])
-    later = emulators.receive()
-    emulators.load_state_dict(state)
-    assert_equal(later, emulators.step([1, 2], [2, 0]))
-
-
 def test_steps_of_other_environments_can_be_under_way(emulators: Emulators) -> None:
     state = emulators.state_dict()
     emulators.send([1, 2], [2, 0])

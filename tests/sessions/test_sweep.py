@@ -17,7 +17,7 @@ from atlantis_exp.commands.jobs import words_of
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import NOTE, Artifact, Journal, Tags, read_commit
+from atlantis_exp.runs.journal import NOTE, Artifact, Journal, Tags
 from atlantis_exp.sessions.job import Job, fitted
 from atlantis_exp.sessions.launchers import Launcher
 from atlantis_exp.sessions.sweep import _every, ledger
@@ -235,22 +235,6 @@ def test_a_sweep_that_a_signal_ends_is_closed(tiny: Compose, tmp_path: Path, num
         sweep()
     signal.signal(signal.SIGINT, before)
     assert page_of(tmp_path).status == "KILLED"
-
-
-@pytest.mark.slow
-def test_a_larger_sweep_takes_the_runs_of_a_smaller_one_over(
-    pair: list[Job], tiny: Compose, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with ledger(pair, ["seed=0,1"]):
-        pass
-    shown = [line for line in capsys.readouterr().out.splitlines() if not line.startswith("publishing")]
-    assert len(shown) == 6  # two tables: what trains here shows itself
-    small = {read_commit(path).parent for path in (pair[0].outputs / "runs").iterdir()}  # type: ignore[union-attr]
-    with ledger([*pair, Job(tiny(*SHORT, "seed=2"))], ["seed=0,1,2"]):
-        pass
-    large = {read_commit(path).parent for path in (pair[0].outputs / "runs").iterdir()}  # type: ignore[union-attr]
-    assert len(small) == len(large) == 1
-    assert small != large
 
 
 def test_a_launchers_sweep_marks_what_was_killed_before_it(tiny: Compose, tmp_path: Path) -> None:

@@ -62,14 +62,6 @@ def test_a_damaged_journal_of_a_folder_without_checkpoints_is_one_line(recorded:
 
 
 @pytest.mark.slow
-def test_best_of_the_commit_before_is_found_where_the_last_is_damaged(interrupted: RunFolder) -> None:
-    newest = max(interrupted.checkpoints.glob("[0-9]*"))
-    (newest / "state.json").write_bytes(b"{}")
-    weights, step = stored_weights(interrupted, "best")
-    assert (step, weights) == (80, interrupted.artifact("models/network/80.safetensors").read_bytes())
-
-
-@pytest.mark.slow
 def test_the_run_goes_on_with_the_best_of_its_last_commit(tiny: Compose, interrupted: RunFolder) -> None:
     train(Job(tiny("tracking.commit_episodes=1", "phase.quick.steps=160")))
     weights, step = stored_weights(interrupted, "best")

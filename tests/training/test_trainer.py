@@ -13,7 +13,7 @@ import torch
 
 from atlantis_exp.build import make_emulator
 from atlantis_exp.config import Config
-from atlantis_exp.game.vector import Steps, WorkerDied
+from atlantis_exp.game.vector import Steps
 from atlantis_exp.learning.schedules import Linear
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.replay.samplers import Draw, PrioritizedSampler, Sampler, TopHalfSampler, UniformSampler
@@ -408,21 +408,6 @@ def test_an_evaluation_that_is_asked_to_stop_is_made_good(small: Small, tmp_path
     assert step not in dict(curve(tmp_path / "broken", "evaluation/mean"))
     continued = small(tmp_path / "broken", phases=phases(120))
     assert continued.run() == "finished"
-    assert print_of(continued, tmp_path / "broken") == print_of(unbroken, tmp_path / "unbroken")
-
-
-@pytest.mark.slow
-def test_a_run_goes_on_after_its_worker_was_killed(tiny: Compose, started: Start, tmp_path: Path) -> None:
-    config = tiny("env.num_envs=3", "env.workers=2")
-    unbroken = started(config, tmp_path / "unbroken")
-    unbroken.run()
-    trainer = started(config, tmp_path / "broken")
-    trainer.run(after(20))
-    trainer.emulators._processes[1].kill()  # type: ignore[attr-defined]
-    with pytest.raises(WorkerDied, match="SIGKILL"):
-        trainer.run()
-    continued = started(config, tmp_path / "broken")
-    continued.run()
     assert print_of(continued, tmp_path / "broken") == print_of(unbroken, tmp_path / "unbroken")
 
 
