@@ -11,13 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from atlantis_exp.comparison.choosing import group
 from atlantis_exp.comparison.export_tables import UNITS, to_latex, with_units
-from atlantis_exp.comparison.gather import gather
 from atlantis_exp.comparison.page import COLUMNS, shown_columns
 from atlantis_exp.comparison.published import Table
-from atlantis_exp.comparison.tables import compare
-from atlantis_exp.comparison.verdict import Question
+from tests.comparison.folders import compared_by
 
 Recorded = Callable[..., Path]
 
@@ -139,8 +136,7 @@ def tables(recorded: Recorded, tmp_path: Path) -> dict[str, Table]:
     for model, score in (("cnn", 1_000.0), ("resnet", 3_000.0)):
         for seed in (0, 1):
             recorded(f"model={model}", f"seed={seed}", scores=(score, score + 500 * seed, 2 * score), truncated=1)
-    gathered = gather(tmp_path)
-    return compare(gathered, group(gathered.trainings, ["model"]), Question(("model",))).tables
+    return compared_by(tmp_path).tables
 
 
 def test_all_tables_of_a_comparison_become_latex(tables: dict[str, Table]) -> None:
