@@ -81,9 +81,8 @@ class Account:
 
     def limit(self, asked: Sequence[Family]) -> list[Family]:
         """Return the families with the error that the account leaves them."""
-        left = [self.errors.get(family.name, family.plan.error) for family in asked]
         return [
-            replace(family, plan=replace(family.plan, error=error)) for family, error in zip(asked, left, strict=True)
+            replace(each, plan=replace(each.plan, error=self.errors.get(each.name, each.plan.error))) for each in asked
         ]
 
     @property

@@ -142,9 +142,7 @@ class Contest:
     def comparing(self) -> str:
         """The command that compares the runs as they have been here, which spends no error and finds nothing else."""
         question = self.question
-        delta = None if question.delta is None else f"{question.delta:.12g}"
-        if question.delta is not None and question.relative:
-            delta = f"{100 * question.delta:.12g}%"
+        delta = question.delta and (f"{100 * question.delta:.12g}%" if question.relative else f"{question.delta:.12g}")
         return command_line(
             *("compare", f"by={','.join(question.by)}", f"runs={self.folder.name}", f"seeds={question.seeds}"),
             f"at_epsilon={self.config.evaluation.epsilon}",

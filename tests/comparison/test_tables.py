@@ -16,7 +16,7 @@ import scipy.stats
 from atlantis_exp.build import build_game
 from atlantis_exp.comparison.figures import draw
 from atlantis_exp.comparison.page import plain
-from atlantis_exp.comparison.published import curves, early_dqn, scores
+from atlantis_exp.comparison.published import curves, scores
 from atlantis_exp.comparison.tables import Comparison, to_csv
 from atlantis_exp.components import facts_of, known
 from atlantis_exp.game.emulator import Emulator
@@ -242,13 +242,17 @@ def test_the_time_cap_is_named_where_it_decides(compared: Callable[..., Comparis
 
 
 def test_early_scores_below_random_come_with_the_reason(compared: Callable[..., Comparison]) -> None:
-    assert early_dqn(ATLANTIS) in compared().notes
-    assert "At 5 M frames published DQN scores 7,433 to 8,341, below the random player's 12,850" in early_dqn(ATLANTIS)
+    early = "at 5 M frames published DQN is at 7,000 to 9,000"
+    assert any(
+        note.startswith(f"Scores below the random player's are normal so early: {early}") for note in compared().notes
+    )
+    means = [row["mean"] for row in curves(ATLANTIS) if row["name"].startswith("DQN") and row["frames"] == 5e6]
+    assert 7_000 < min(means) < max(means) < 9_000
 
 
 def test_a_late_curve_has_the_published_ones_next_to_it_and_no_excuse(compared: Callable[..., Comparison]) -> None:
     comparison = compared(curve=((0, 0, 0, 0), (12_000_000, 9, 9, 9_000)))
-    assert early_dqn(ATLANTIS) not in comparison.notes
+    assert not any("normal so early" in note for note in comparison.notes)
     assert {row["frames"] for row in comparison.tables["published_curves"]} == {1e6 * n for n in range(1, 11)}
 
 
