@@ -32,6 +32,7 @@ from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.training import measure
+from atlantis_exp.tracking.store import first_line
 from atlantis_exp.training.checkpoint import Checkpoints, to_safetensors
 from atlantis_exp.training.fingerprint import fingerprint
 
@@ -57,9 +58,7 @@ def check(contracts: Iterator[Contract], measured: Mapping[str, Job]) -> None:
             with terminal.working(f"{part}: {contract}"):
                 trial()
         except Exception as error:
-            kind = "" if isinstance(error, Fault) else f"{type(error).__name__}: "
-            because = kind + next((line for line in str(error).splitlines() if line.strip()), "")
-            because = because or "no reason given"
+            because = first_line(error) or repr(error)
         tried.append(documents.Trial(component=part, contract=contract, kept=not because, because=because))
     table = Table("component", "contract", "", "because")
     for each in tried:
