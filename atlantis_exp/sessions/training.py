@@ -142,14 +142,13 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
         state = trainer.checkpoints.load(trainer.memory, progress.say)
     folder.write_config(to_dict(config))
     done = Counters()
-    if state is not None:
-        with unforged(folder.checkpoints):
-            done = Counters.of(state["counters"])
     if state is None:
         if (weights := _initial_weights(config)) is not None:
             trainer.learner.begin_with(weights)
         progress.say(f"starting run {folder.name} in {folder.path}{_kin(job, folder)}")
     else:
+        with unforged(folder.checkpoints):
+            done = Counters.of(state["counters"])
         progress.say(f"continuing run {folder.name} at step {done.steps:,}")
     if config.budget.forecast != "off":
         # Before there is anything to publish: MLflow's import at the same time took three quarters of the speed.
