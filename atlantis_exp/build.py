@@ -107,8 +107,7 @@ def choose_precision(name: str, device: torch.device) -> str:
 def build_component(config: cfg.Config, part: cfg.ComponentConfig, *given: object) -> Any:
     """Return a component of a config, made of `given` arguments and its settings.
 
-    Raises:
-        ConfigError: its plugin is not named on the command line, or its code fails.
+    Raises: ConfigError if its plugin is not named on the command line, or its code fails.
     """
     if (component := part.component) is None:
         raise ConfigError(needs(config))

@@ -325,8 +325,7 @@ def admit(references: Sequence[str]) -> None:
     references: files, as ./mynet.py, or names of installed distributions. The same ones again are not read again, so
     that a sweep trains one version.
 
-    Raises:
-        ConfigError: a plugin cannot be imported or breaks a contract, or a name is taken.
+    Raises: ConfigError if a plugin cannot be imported or breaks a contract, or a name is taken.
     """
     global _references, _admitted
     if (given := tuple(references)) == _references:

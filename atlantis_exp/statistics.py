@@ -1,6 +1,6 @@
 """Summaries, intervals and comparisons of episode scores."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,31 +53,6 @@ def interquartile_mean(scores: Scores) -> float:
     low, high = len(scores) // 4, len(scores) - len(scores) // 4
     # As scipy's trim_mean to the last bit, which costs a second to import.
     return float(np.partition(np.asarray(scores, np.float64), (low, high - 1))[low:high].mean())
-
-
-def resample(seeds: Sequence[Scores], resamples: int, rng: np.random.Generator) -> Iterator[Scores]:
-    """Draw bootstrap samples: seeds with replacement, then each one's episodes. Raises: ValueError without seeds.
-
-    Each sample pools the episodes of its seeds; only one at a time is in memory.
-    """
-    if not seeds:
-        raise ValueError("a bootstrap needs at least one seed")
-    pool = np.concatenate(seeds)
-    sizes = np.array([seed.size for seed in seeds])
-    starts = np.cumsum(sizes) - sizes
-
-    def drawn() -> Scores:
-        chosen = rng.integers(len(seeds), size=len(seeds))
-        size = sizes[chosen]
-        return pool[np.repeat(starts[chosen], size) + rng.integers(np.repeat(size, size))]
-
-    return (drawn() for _ in range(resamples))
-
-
-def interval(estimates: Sequence[float] | Sequence[Scores] | Scores) -> npt.NDArray[np.float64]:
-    """Return the middle 95 % of bootstrap estimates along their first axis, (2, ...): the percentile method."""
-    ends: npt.NDArray[np.float64] = np.percentile(np.asarray(estimates), (2.5, 97.5), axis=0)
-    return ends
 
 
 def probability_of_improvement(scores: Scores, others: Scores) -> float:

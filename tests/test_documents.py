@@ -114,12 +114,3 @@ def test_a_check_names_what_is_broken_in_its_document_before_it_fails(capfd: pyt
         ("splits", False, "ValueError: loses a batch"),
     ]
     assert found.costs == []
-
-
-@pytest.mark.slow
-def test_a_check_has_every_trial_and_cost(answer: Callable[..., Any], tiny_overrides: tuple[str, ...]) -> None:
-    words = [text for text in tiny_overrides if not text.startswith(("model=", "sampler=", "objective="))]
-    found = answer("check", *words, "objective=dqn")
-    assert isinstance(found, Check)
-    assert all(each.kept for each in found.trials)
-    assert [(each.component, each.pixels) for each in found.costs] == [("objective=dqn", 40)]

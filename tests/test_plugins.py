@@ -24,7 +24,6 @@ from atlantis_exp.config import Config
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.sessions.contracts import fingerprints
 from atlantis_exp.sessions.job import replaced
-from benchmarks.kills import train_and_kill
 
 Command = Callable[..., int]
 Said = Callable[..., str]
@@ -191,19 +190,6 @@ def test_all_kinds_from_files_are_trained_and_continued_bit_for_bit(
 
 
 @pytest.mark.slow
-def test_all_kinds_from_files_are_killed_and_continued_bit_for_bit(
-    plugins: Path, tiny_overrides: tuple[str, ...]
-) -> None:
-    words = replaced(tiny_overrides, "phase.quick.steps=300", "env.max_steps=20", "evaluation.at_end=false")
-    words += located(["plugins=[./mynet.py,parts.py]", *PARTS, "tracking.commit_episodes=3"])
-    ((_, config),) = check("config", Config, words).items()
-    assert train_and_kill(config, words, plugins / "unbroken", 0) == 0
-    assert train_and_kill(config, words, plugins / "killed", 2) > 0
-    whole, killed = (fingerprints(config, plugins / place) for place in ("unbroken", "killed"))
-    assert whole == killed
-
-
-@pytest.mark.slow
 def test_a_sweep_side_by_side_finds_plugins_and_options_of_one_s_own(
     plugins: Path, tiny_overrides: tuple[str, ...]
 ) -> None:
@@ -216,20 +202,6 @@ def test_a_sweep_side_by_side_finds_plugins_and_options_of_one_s_own(
     runs = [RunFolder(path) for path in sorted(plugins.glob("outputs/runs/*"))]
     assert {run.state for run in runs} == {"done"}
     assert sorted(run.config["model"].get("width", 0) for run in runs) == [0, 8, 32]
-
-
-@pytest.mark.slow
-def test_a_search_tries_a_network_from_a_file(
-    plugins: Path, command: Command, tiny_overrides: tuple[str, ...], capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("optuna", reason="needs pip install 'atlantis-exp[search]'")
-    words = replaced(tiny_overrides, "phase.quick.steps=20", "evaluation.every_steps=null", "paths.outputs=outputs")
-    words += ["plugins=mynet.py", "model=mynet", "model.width=4,12", "trials=2"]
-    assert command("search", *words) == 0, capsys.readouterr().err
-    runs = [RunFolder(path) for path in plugins.glob("outputs/runs/*")]
-    assert {run.state for run in runs} == {"done"}
-    assert {run.config["model"]["name"] for run in runs} == {"mynet"}
-    assert {run.config["model"]["width"] for run in runs} <= {4, 12}
 
 
 @pytest.mark.slow

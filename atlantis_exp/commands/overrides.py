@@ -115,8 +115,7 @@ def refuse_twice(arguments: Sequence[str]) -> None:
 def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[tuple[str, ...], T]:
     """Compose and check every job of a command line; return their configs by their overrides and --config-dir.
 
-    Raises:
-        ConfigError: one line for the first mistake, with the nearest valid choice or the valid range.
+    Raises: ConfigError, one line for the first mistake with the nearest valid choice or the valid range.
     """
     flags = flags_of(arguments)
     overrides = [read_override(text) for text in flags.overrides]

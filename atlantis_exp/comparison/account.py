@@ -81,9 +81,8 @@ class Account:
 
     def limit(self, asked: Sequence[Family]) -> list[Family]:
         """Return the families with the error that the account leaves them."""
-        left = [self.errors.get(family.name, family.plan.error) for family in asked]
         return [
-            replace(family, plan=replace(family.plan, error=error)) for family, error in zip(asked, left, strict=True)
+            replace(each, plan=replace(each.plan, error=self.errors.get(each.name, each.plan.error))) for each in asked
         ]
 
     @property
@@ -98,8 +97,7 @@ def read_account(
 ) -> Account:
     """Return the account of a question, read from all comparisons next to its folder.
 
-    Raises:
-        Fault: if the folder's own looks are damaged or gone.
+    Raises: Fault if the folder's own looks are damaged or gone.
     """
     others, damaged = [], []
     for path in sorted(folder.path.parent.glob(f"*/{LOOKS}")):

@@ -44,8 +44,7 @@ def is_where(run: Run, where: Sequence[str]) -> bool:
 def group(runs: Iterable[R], by: Sequence[str]) -> dict[str, list[R]]:
     """Group runs by config keys or tags, `model` being short for `model.name`; in the order of the groups' labels.
 
-    Raises:
-        ConfigError: on a key that no run has.
+    Raises: ConfigError on a key that no run has.
     """
     runs = list(runs)
     for key in by:
@@ -84,10 +83,7 @@ def shortened(keys: Iterable[str], facts: Mapping[str, Any]) -> tuple[str, ...]:
 def mixed_protocol(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -> tuple[str, str] | None:
     """Return which part of the protocol differs, `game` or a key, and a sentence about it; None if scores compare.
 
-    Keys of `by` may differ, except the game.
-
-    Args:
-        configs: by the names of runs or contenders, with dotted keys.
+    Keys of `by` may differ, except the game. Configs are by the names of runs or contenders, with dotted keys.
     """
     games = {name: title_of(config["env.id"]) for name, config in configs.items()}
     if len(set(games.values())) > 1:

@@ -21,11 +21,9 @@ _LONGEST = 100  # characters of a group's name
 def read_scores(path: Path, columns: Mapping[str, str]) -> list[Group]:
     """Read the groups of a table with a row for each episode, evaluation or seed; rows of one seed are averaged.
 
-    Args:
-        columns: the names of the columns for group, seed and score where these are not theirs. No other one is read.
+    columns: the names of the columns for group, seed and score where these are not theirs. No other one is read.
 
-    Raises:
-        ConfigError: naming the row and the column that cannot be read.
+    Raises: ConfigError naming the row and the column that cannot be read.
     """
     columns = dict(zip(_COLUMNS, _COLUMNS, strict=True)) | dict(columns)
     found: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))

@@ -50,11 +50,9 @@ def training_score(episodes: TrainingEpisodes, steps: int, num_envs: int, window
     window is too low while a network learns, since an episode that ends has begun with an earlier one. An episode that
     began before the window counts with its steps within it, and open episodes with the points a step of the others.
 
-    Args:
-        steps: of the whole training, of all environments together.
+    steps: of the whole training, of all environments together.
 
-    Raises:
-        ValueError: where fewer than `FEWEST_EPISODES` episodes ended in the window.
+    Raises: ValueError where fewer than `FEWEST_EPISODES` episodes ended in the window.
     """
     start = steps * (1 - window)
     ended = episodes.ends > start
@@ -82,8 +80,7 @@ def by_training(trainings: Sequence[Training], outputs: Path, window: float) -> 
 
     None is left out: those whose games are too long to be estimated may be the best ones.
 
-    Raises:
-        ConfigError: for a training without such a score, or two whose epsilon differs in the window.
+    Raises: ConfigError for a training without such a score, or two whose epsilon differs in the window.
     """
     explored = {training.name: _epsilon(training, window) for training in trainings}
     least, most = min(explored, key=explored.__getitem__), max(explored, key=explored.__getitem__)

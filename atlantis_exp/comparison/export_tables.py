@@ -5,13 +5,12 @@ import unicodedata
 from collections.abc import Mapping
 from functools import lru_cache
 
-from atlantis_exp.comparison.gather import AXES
 from atlantis_exp.comparison.page import COLUMNS, SHARES, cells, label, shown_columns
-from atlantis_exp.comparison.published import Row, Table
+from atlantis_exp.comparison.published import Table
 from atlantis_exp.components import facts_of, known
 
 _FRACTION = "fraction"
-"""The unit of shares and probabilities, from 0 to 1; LaTeX has percent instead, as a person reads them."""
+"""The unit of shares and probabilities, from 0 to 1, which LaTeX has in percent, as the page."""
 
 UNITS: Mapping[str, str] = {
     **dict.fromkeys(
@@ -37,9 +36,6 @@ UNITS: Mapping[str, str] = {
 """The unit of a column of a comparison's tables or of `load_runs`; frames are the emulator's, FLOPs those of gradient
 updates. A column that is not here counts something that its name says, or is not a quantity."""
 
-_AXIS_UNITS = {name: UNITS[axis] for axis, view in AXES.items() for name in (axis, view)}
-"""The unit in which a row's `at` or `x` is, by its `view` or `axis`."""
-
 
 def unit(name: str, column: str) -> str:
     """Return the unit of a column of a table; empty if it has none, or one for each row (`at` and `x`)."""
@@ -56,27 +52,26 @@ def with_units(name: str, table: Table) -> Table:
 def to_latex(name: str, table: Table) -> str:
     """Write a table as a LaTeX tabular for the package booktabs; an empty one is an empty text.
 
-    A table that the page shows has the page's columns and headers, another one all of its own. Numbers have thousands
-    separators, intervals are written as `a (b to c)`, and shares are in percent. Every character that LaTeX would read
-    as more than itself is escaped.
+    Columns, headers and cells are the page's; a table that the page does not show has all its columns. Every character
+    that LaTeX would read as more than itself is escaped.
     """
     if not table:
         return ""
     columns = shown_columns(name, table)
-    units = {column: unit(name, column) for column in columns}
-    header = [_escaped(_with_unit(label(name, column), "%" if of == _FRACTION else of)) for column, of in units.items()]
+    units = (unit(name, column) for column in columns)
+    header = [
+        _with_unit(label(name, column), "" if of == _FRACTION else of)
+        for column, of in zip(columns, units, strict=True)
+    ]
     rows = [cells(name, row, columns) for row in table]
     sides = ["r" if any(is_number for _, is_number in column) else "l" for column in zip(*rows, strict=True)]
-    lines = [
-        [_cell(column, row, units[column], *cell) for column, cell in zip(columns, texts, strict=True)]
-        for row, texts in zip(table, rows, strict=True)
-    ]
+    lines = [[_number(text) if is_number else _escaped(text) for text, is_number in row] for row in rows]
     return "\n".join(
         [
             f"% The table {' '.join(name.split())} of a comparison; it needs \\usepackage{{booktabs}}.",
             rf"\begin{{tabular}}{{{''.join(sides)}}}",
             r"\toprule",
-            " & ".join(header) + r" \\",
+            " & ".join(map(_escaped, header)) + r" \\",
             r"\midrule",
             *(" & ".join(line) + r" \\" for line in lines),
             r"\bottomrule",
@@ -88,19 +83,6 @@ def to_latex(name: str, table: Table) -> str:
 
 def _with_unit(label: str, of: str) -> str:
     return label if not of or label.lower() == of.lower() else f"{label} ({of})"
-
-
-def _cell(column: str, row: Row, of: str, text: str, is_number: bool) -> str:
-    """Write a cell without the unit that its header has; a dash if there is nothing."""
-    if not text:
-        return "" if row.get(column) == "" else "--"
-    if not is_number:
-        return _escaped(text)
-    if of == _FRACTION:
-        text = text.replace("%", "")
-    elif column in ("at", "x"):
-        text = f"{text} {_AXIS_UNITS.get(str(row.get('view', row.get('axis'))), '')}".rstrip()
-    return _number(text)
 
 
 _LATEX = {

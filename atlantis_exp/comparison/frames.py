@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -47,6 +47,9 @@ _EPISODE = (
 _FRAMES, _HOURS, _UPDATES = "throughput/frames", "throughput/hours", "learning/updates"
 _POINT = ("run", "step", "frames", "hours", "flops")
 
+_Parts = tuple[Row, list[Row], list["pd.DataFrame"], list["pd.DataFrame"]]
+"""A run's part of each frame: its row, evaluations, episodes and curve."""
+
 
 @dataclass(frozen=True)
 class Runs:
@@ -66,15 +69,6 @@ class Runs:
     episodes: "pd.DataFrame"
     curves: "pd.DataFrame"
     skipped: dict[str, str]
-
-
-class _Frames(NamedTuple):
-    """A run's part of each frame."""
-
-    row: Row
-    evaluations: list[Row]
-    episodes: list["pd.DataFrame"]
-    curve: "pd.DataFrame | None"
 
 
 def load_runs(
@@ -115,13 +109,13 @@ def load_runs(
         raise ConfigError(f"{outputs / 'runs'}: no such folder; load_runs takes the folder of paths.outputs")
     stored, patterns = read_runs(outputs, _listed(runs)), named_by(outputs, _listed(runs))
     skipped = dict(stored.skipped)
-    read = list[_Frames]()
+    read = list[_Parts]()
     for run in select([run for run in stored.runs if fits(run.name, patterns)], _listed(where)):
         try:
-            frames = _read(run, sys.maxsize if points is None else points, skipped)
+            parts = _read(run, sys.maxsize if points is None else points, skipped)
             if score == "training" and run.trained is not None and run.folder.final_result is not None:
-                frames.row["score"] = _training_score(run, end)
-            read.append(frames)
+                parts[0]["score"] = _training_score(run, end)
+            read.append(parts)
         except UNREADABLE as error:
             skipped[run.name] = f"broken: {error}"
     for name, reason in skipped.items():
@@ -143,7 +137,7 @@ def _listed(texts: str | Sequence[str]) -> list[str]:
     return texts.split(",") if isinstance(texts, str) and texts else list(texts)
 
 
-def _read(run: StoredRun, points: int, skipped: dict[str, str]) -> _Frames:
+def _read(run: StoredRun, points: int, skipped: dict[str, str]) -> _Parts:
     """Read a run's folder; note a later evaluation that is damaged in `skipped`. Raises: as UNREADABLE."""
     folder, commit, result = run.folder, run.folder.commit, run.folder.final_result
     row = dict(run.config)
@@ -178,7 +172,7 @@ def _read(run: StoredRun, points: int, skipped: dict[str, str]) -> _Frames:
         if final and run.trained:
             row["score"] = evaluations[-1]["iqm"]
         episodes.append(_episodes(place, table))
-    return _Frames(row, evaluations, episodes, _curve(run, points) if run.trained else None)
+    return row, evaluations, episodes, _curve(run, points) if run.trained else []
 
 
 def _evaluation(evaluated: Evaluated, table: EpisodeTable) -> Row:
@@ -212,7 +206,7 @@ def _episodes(place: Row, table: EpisodeTable) -> "pd.DataFrame":
     return pd.DataFrame({**place, **columns})
 
 
-def _curve(run: StoredRun, points: int) -> "pd.DataFrame | None":
+def _curve(run: StoredRun, points: int) -> list["pd.DataFrame"]:
     import pandas as pd
 
     flops = float(run.tags.get("flops_per_update", "nan"))
@@ -222,27 +216,27 @@ def _curve(run: StoredRun, points: int) -> "pd.DataFrame | None":
         so_far = (values.pop(_FRAMES), values.pop(_HOURS, np.nan), values.get(_UPDATES, np.nan) * flops)
         rows.append({**dict(zip(_POINT, (run.name, point.step, *so_far), strict=True)), **values})
     if not rows:
-        return None
+        return []
     long = pd.DataFrame(rows).melt([*_POINT], var_name="key").dropna(subset="value")
-    return long.sort_values("step", kind="stable")
+    return [long.sort_values("step", kind="stable")]
 
 
-def _assemble(read: Sequence[_Frames], skipped: dict[str, str]) -> Runs:
+def _assemble(read: Sequence[_Parts], skipped: dict[str, str]) -> Runs:
     import pandas as pd
 
-    rows = [each.row for each in read]
+    rows = [row for row, *_ in read]
     pays = [row.pop("sources") for row in rows] or [facts_of(game).sources for game in known("env").values()]
     sources = [*dict.fromkeys(source for each in pays for source in each)]
     keys = sorted(dict.fromkeys(key for row in rows for key in row if key not in _RUN), key=_section)
     runs = pd.DataFrame({key: _column([row.get(key) for row in rows]) for key in (*_RUN, *keys)})
     for key in ("started", "updated"):
         runs[key] = pd.to_datetime(runs[key], unit="ms", utc=True)
-    evaluations = pd.DataFrame([row for each in read for row in each.evaluations], columns=[*_EVALUATION, *sources])
+    evaluations = pd.DataFrame([row for _, rows, *_ in read for row in rows], columns=[*_EVALUATION, *sources])
     return Runs(
         runs=runs,
         evaluations=evaluations.astype({"final": bool}),
-        episodes=_joined([frame for each in read for frame in each.episodes], [*_EPISODE, *sources]),
-        curves=_joined([each.curve for each in read if each.curve is not None], [*_POINT, "key", "value"]),
+        episodes=_joined([frame for *_, frames, _ in read for frame in frames], [*_EPISODE, *sources]),
+        curves=_joined([frame for *_, frames in read for frame in frames], [*_POINT, "key", "value"]),
         skipped=skipped,
     )
 

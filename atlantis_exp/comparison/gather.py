@@ -318,8 +318,7 @@ def is_of_another(evaluation: RunFolder, run: RunFolder) -> bool:
 def named_by(outputs: Path, runs: Iterable[str]) -> list[str]:
     """Return the names, starts of names and patterns of `runs`, a decision's name replaced by those of its runs.
 
-    Raises:
-        Fault: if a decision's folder is damaged.
+    Raises: Fault if a decision's folder is damaged.
     """
     folders = {path.name: RunFolder(path) for path in (outputs / "decisions").glob("decide-*")}
     patterns: list[str] = []

@@ -23,11 +23,9 @@ Record = dict[str, list[Look]]
 def read_looks(folder: Path, families: Sequence[Family], continued: Collection[str] = ()) -> Record:
     """Read the looks taken at some families; empty before the first.
 
-    Args:
-        continued: families that may have looks of an earlier question with another plan.
+    continued: families that may have looks of an earlier question with another plan.
 
-    Raises:
-        Fault: if no comparison of these families can have written the file, or a comparison that was made lacks it.
+    Raises: Fault if no comparison of these families can have written the file, or a comparison that was made lacks it.
     """
     path = folder / LOOKS
     if not path.exists():
@@ -57,24 +55,20 @@ def write_looks(folder: Path, answers: Sequence[Answer]) -> None:
 
 def _check(family: Family, looks: Sequence[Look], is_continued: bool) -> None:
     """Raise ValueError for looks that the family's plan cannot have led to."""
-    open_pairs = set(family.plan.pairs(family.seeds))
+    open_pairs = sorted(family.plan.pairs(family.seeds))
     size, spent = FEWEST_SEEDS - 1, 0.0
+    last = np.inf if is_continued else family.plan.looks[-1]
     for look in looks:
-        pairs = {(verdict.group, verdict.other) for verdict in look.verdicts}
-        sizes = {len(set(seeds)) for seeds in look.seeds.values()} | {look.size if look.seeds else 0}
-        numbers = [value for verdict in look.verdicts for value in (verdict.difference, verdict.low, verdict.high)]
-        spent += look.error
-        if (
-            pairs != open_pairs
-            or len(pairs) != len(look.verdicts)
-            or {name for pair in pairs for name in pair} != set(look.seeds)
-        ):
+        pairs = sorted((verdict.group, verdict.other) for verdict in look.verdicts)
+        if pairs != open_pairs or {name for pair in pairs for name in pair} != look.seeds.keys():
             raise ValueError(f"its looks by {family.name} are at other pairs")
-        sizes |= {verdict.seeds for verdict in look.verdicts}
-        last = np.inf if is_continued else family.plan.looks[-1]
-        if len(sizes) != 1 or not size < look.size <= last or not np.isfinite(numbers).all():
+        before, size = size, look.size
+        sizes = {size, *(len({*seeds}) for seeds in look.seeds.values()), *(verdict.seeds for verdict in look.verdicts)}
+        numbers = [value for verdict in look.verdicts for value in (verdict.difference, verdict.low, verdict.high)]
+        if len(sizes) > 1 or not before < size <= last or not np.isfinite(numbers).all():
             raise ValueError(f"its looks by {family.name} are at impossible numbers")
-        planned = family.plan.spendable(look.size)
+        spent += look.error
+        planned = family.plan.spendable(size)
         if not (0 < spent <= 1 if is_continued else np.isclose(spent, planned, rtol=1e-6)):
             raise ValueError(f"its looks by {family.name} spent another error than the plan lets them")
         for verdict in look.verdicts:
@@ -82,5 +76,5 @@ def _check(family: Family, looks: Sequence[Look], is_continued: bool) -> None:
             is_so = found.get(verdict.said, verdict.low <= 0 <= verdict.high)
             if not (is_so and verdict.low <= verdict.difference <= verdict.high):
                 raise ValueError(f"its looks by {family.name} say what their intervals do not")
-        size = look.size
-        open_pairs = {(verdict.group, verdict.other) for verdict in look.verdicts if verdict.said == "not decided"}
+        undecided = (verdict for verdict in look.verdicts if verdict.said == "not decided")
+        open_pairs = sorted((verdict.group, verdict.other) for verdict in undecided)

@@ -1,7 +1,6 @@
 """Say what a reader must know before believing a comparison: a function a subject, which yields its lines or none."""
 
 import json
-import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,14 +20,13 @@ from atlantis_exp.comparison.decision import (
     size_found,
 )
 from atlantis_exp.comparison.gather import AXES, StoredRun, Training
-from atlantis_exp.comparison.published import Table, early_dqn, random_line
+from atlantis_exp.comparison.published import Table, random_line
 from atlantis_exp.comparison.verdict import Answer, Group, Question
 from atlantis_exp.comparison.words import IN_FULL, listed, margin, measure, spent
 from atlantis_exp.components import Component, facts_of
 from atlantis_exp.runs.folder import LOST
 from atlantis_exp.terminal import PROGRAM
 
-_LENGTH = re.compile(r"phase\.\d+\.(episodes|steps)")
 _SHARES = {"frames": "{:,.0f} frames", "hours": "{:.2f} hours", "flops": "{:.3g} FLOPs"}  # by axis
 
 
@@ -245,26 +243,6 @@ def moved_seeds(facts: Facts) -> Iterator[str]:
             )
 
 
-def in_training(facts: Facts) -> Iterator[str]:
-    """Name the group that leads in each view, if the intervals of its differences leave out zero."""
-    outcomes: dict[str, list[str]] = defaultdict(list)
-    views = facts.tables["views"]
-    shown = dict.fromkeys(row["view"] for row in views)
-    for view in shown:
-        rows = [row for row in views if row["view"] == view]
-        if all(row["low"] > 0 for row in rows):
-            outcomes[f"{rows[0]['leader']} leads at {{}}"].append(view)
-        elif any(row["low"] <= 0 for row in rows):
-            outcomes["no lead is clear at {}, where an interval includes zero"].append(view)
-        else:
-            outcomes["nothing can be said of {}, for want of seeds"].append(view)
-    if len(facts.groups) > 1 and (missing := [view for view in AXES.values() if view not in shown]):
-        outcomes["nothing is known of {}, since a run has no such curve or too short a one"] = missing
-    if outcomes:
-        said = "; ".join(text.format(" and ".join(at)) for text, at in outcomes.items())
-        yield f"In training, {said}: descriptions, not verdicts."
-
-
 def mixed(facts: Facts) -> Iterator[str]:
     """Name differences within a group, and between groups beyond the question."""
     varied = {label: _differing([run.science for run in runs]) for label, runs in facts.groups.items()}
@@ -283,23 +261,17 @@ def mixed(facts: Facts) -> Iterator[str]:
         yield f"The groups also differ in {_values(between)}."
 
 
-def equal_shares(facts: Facts) -> Iterator[str]:
-    """Say whether all runs were trained for equal steps, episodes or arithmetic, and what a run took of the others."""
-    if not (runs := facts.trainings):
+def shares(facts: Facts) -> Iterator[str]:
+    """Say which limit ended all runs, and what a run took on average."""
+    ended = {*map(_ended_by, facts.trainings)}
+    if len(ended) != 1 or len(facts.groups) < 2:
         return
-    (ended, *others) = dict.fromkeys(map(_ended_by, runs))
-    phases = {tuple((key, run.science[key]) for key in sorted(run.science) if _LENGTH.fullmatch(key)) for run in runs}
-    if others or len(facts.groups) < 2 or (ended == "the whole plan" and len(phases) > 1):
-        return
-    share = "arithmetic" if "budget.flops" in ended else "steps"
-    if "budget" not in ended and any(key.endswith("episodes") and value for key, value in phases.pop()):
-        share = "episodes"
     took = []
     for label, trained in facts.groups.items():
         ends = {axis: [run.curve[axis][-1] for run in trained if axis in run.curve] for axis in AXES}
         each = [_SHARES[axis].format(fmean(values)) for axis, values in ends.items() if values]
         took.append(f"{label} {', '.join(each)}")
-    yield f"The runs were trained for equal {share} ({ended}). On average a run took: {'; '.join(took)}."
+    yield f"All runs were trained for {ended.pop()}. On average a run took: {'; '.join(took)}."
 
 
 def begun(facts: Facts) -> Iterator[str]:
@@ -348,9 +320,9 @@ def other_players(facts: Facts) -> Iterator[str]:
             "No random player was measured under these settings, so a published one takes its place; "
             f"{PROGRAM} baseline with the same env measures one."
         )
-    is_below = any(row["mean"] < random["score"] for row in facts.tables["evaluation"])
-    if is_below and facts.frames <= facts_of(facts.game).early_frames and (why := early_dqn(facts.game)):
-        yield why
+    game, is_below = facts_of(facts.game), any(row["mean"] < random["score"] for row in facts.tables["evaluation"])
+    if is_below and facts.frames <= game.early_frames:
+        yield f"Scores below the random player's are normal so early: {game.early_scores}."
 
 
 CAVEATS: Sequence[Note] = (
@@ -358,7 +330,7 @@ CAVEATS: Sequence[Note] = (
 )
 """What may make a verdict mean something else."""
 
-NOTES: Sequence[Note] = (in_training, equal_shares, mixed, begun, survival_and_rate, time_cap, other_players)
+NOTES: Sequence[Note] = (shares, mixed, begun, survival_and_rate, time_cap, other_players)
 """What is said after it."""
 
 

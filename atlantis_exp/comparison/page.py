@@ -9,6 +9,7 @@ from jinja2 import Environment, StrictUndefined
 from atlantis_exp.comparison.figures import Drawn
 from atlantis_exp.comparison.published import Row, Table
 from atlantis_exp.comparison.tables import Comparison
+from atlantis_exp.comparison.words import points
 
 
 def page(comparison: Comparison, figures: Mapping[str, Drawn], facts: Mapping[str, str]) -> str:
@@ -147,7 +148,7 @@ def number(value: object, column: str = "") -> str:
         return str(value)
     if abs(value) >= 1e9:
         return f"{value:.3g}"
-    return f"{value:,.0f}" if abs(value) >= 10 or value == int(value) else f"{value:.3g}"
+    return points(value)
 
 
 def plain(name: str, table: Table, score: str = "") -> list[list[str]]:

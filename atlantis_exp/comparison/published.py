@@ -46,15 +46,3 @@ def _read(game: Component | None, name: str) -> Table:
 def random_line(references: Table) -> Row | None:
     """Return the random player measured under the runs' own settings, else the published one, if any."""
     return next((row for row in references if row["name"].startswith("random")), None)
-
-
-def early_dqn(game: Component | None) -> str:
-    """Say why scores below random are normal early, from published learning curves; empty without any."""
-    at = [row for row in curves(game) if row["name"].startswith("DQN") and row["frames"] == 5e6]
-    if not at:
-        return ""
-    low, high = min(row["mean"] for row in at), max(row["mean"] for row in at)
-    return (
-        f"At 5 M frames published DQN scores {low:,.0f} to {high:,.0f}, below the random player's "
-        f"{facts_of(game).random_score:,.0f}: below random is normal here ({at[0]['source'].rpartition('/')[0]})."
-    )

@@ -91,12 +91,10 @@ def compare(
 ) -> Comparison:
     """Compare groups of trainings, taking the looks that are due, or with `now` one that is not.
 
-    Args:
-        account: the looks taken before, and the error that is left.
-        scored: the groups with the scores of their seeds; by default those of the trainings.
+    account: the looks taken before, and the error that is left.
+    scored: the groups with the scores of their seeds; by default those of the trainings.
 
-    Raises:
-        ConfigError: if the baseline is not among what is compared.
+    Raises: ConfigError if the baseline is not among what is compared.
     """
     account = account or Account()
     seeds_of = scored or [group_of(runs, question.by) for runs in groups.values()]
@@ -153,10 +151,10 @@ def compare(
 
 
 def to_csv(table: Table) -> str:
-    """Write a table with its keys as header; an empty one is an empty text."""
+    """Write a table with the keys of its rows as header; an empty one is an empty text."""
     text = io.StringIO()
     if table:
-        writer = csv.DictWriter(text, table[0].keys(), lineterminator="\n")
+        writer = csv.DictWriter(text, dict.fromkeys(key for row in table for key in row), lineterminator="\n")
         writer.writeheader()
         writer.writerows(table)
     return text.getvalue()

@@ -98,8 +98,7 @@ def families(groups: Sequence[Group], question: Question) -> list[Family]:
     seed: over those groups that every value has a counterpart of, and the seeds that all of these have. If several keys
     have several values, all groups are a family too. The question's error is divided equally among the families.
 
-    Raises:
-        ConfigError: if the baseline is not among what is compared.
+    Raises: ConfigError if the baseline is not among what is compared.
     """
     keys = [index for index in range(len(question.by)) if len({group.values[index] for group in groups}) > 1]
     if not keys:
@@ -172,10 +171,8 @@ def _family(
 def answer(asked: Sequence[Family], record: Mapping[str, Sequence[Look]], now: bool = False) -> list[Answer]:
     """Take the looks that are due in each family, or with `now` one at the seeds there are.
 
-    Once a look has decided some pairs, the others may have the seeds of the next one already.
-
-    Args:
-        record: the looks taken before, by family.
+    Once a look has decided some pairs, the others may have the seeds of the next one already. The record has the looks
+    taken before, by family.
     """
     answers = []
     for family in asked:

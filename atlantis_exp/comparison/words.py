@@ -36,7 +36,7 @@ def said(answer: Answer) -> str:
     for verdict in verdicts:
         if verdict.said in ("better", "worse"):
             leading = verdict.leading
-            by = f" by {_points(leading.difference)} points ({_interval(leading)})" if in_full else ""
+            by = f" by {points(leading.difference)} points ({_interval(leading)})" if in_full else ""
             of = verdict if plan.baseline is not None else leading
             better[of.group, of.said].append(f"{of.other}{by}")
     sentences = [f"{name} plays {how} than {' and than '.join(others)}" for (name, how), others in better.items()]
@@ -57,8 +57,7 @@ def _undecided(answer: Answer, verdicts: Sequence[Verdict], in_full: bool) -> st
         text = f"Not decided: {len(verdicts)} of {len(decision.verdicts)} pairs"
     else:
         found = (
-            f" (difference {_points(of.difference)}, {_interval(of)})" if in_full and of.seeds else ""
-            for of in verdicts
+            f" (difference {points(of.difference)}, {_interval(of)})" if in_full and of.seeds else "" for of in verdicts
         )
         pairs = (f"{of.group} against {of.other}{interval}" for of, interval in zip(verdicts, found, strict=True))
         text = f"Not decided: {', '.join(pairs)}"
@@ -72,7 +71,7 @@ def _undecided(answer: Answer, verdicts: Sequence[Verdict], in_full: bool) -> st
     reach = max((verdict.detectable or 0.0 for verdict in verdicts), default=0.0)
     if not reach:
         return f"{text}, and there is no further look; the detectable difference is unknown, for seeds do not differ"
-    return f"{text}, and there is no further look; a difference of {_points(reach)} would have been found with 80 %"
+    return f"{text}, and there is no further look; a difference of {points(reach)} would have been found with 80 %"
 
 
 def spent(answer: Answer) -> str:
@@ -89,7 +88,7 @@ def margin(plan: Plan) -> str:
     """Return the plan's delta as a person writes it; empty without one."""
     if plan.delta is None:
         return ""
-    return f"{100 * plan.delta:g} %" if plan.relative else f"{_points(plan.delta)} points"
+    return f"{100 * plan.delta:g} %" if plan.relative else f"{points(plan.delta)} points"
 
 
 def listed(names: Sequence[str]) -> str:
@@ -99,8 +98,9 @@ def listed(names: Sequence[str]) -> str:
 
 
 def _interval(verdict: Verdict) -> str:
-    return f"{_points(verdict.low)} to {_points(verdict.high)}, {verdict.seeds} seeds each"
+    return f"{points(verdict.low)} to {points(verdict.high)}, {verdict.seeds} seeds each"
 
 
-def _points(value: float) -> str:
+def points(value: float) -> str:
+    """Return a number as people write it."""
     return f"{value:,.0f}" if abs(value) >= 10 or value == np.round(value) else f"{value:.3g}"

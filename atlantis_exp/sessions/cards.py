@@ -15,20 +15,19 @@ from rich.table import Table
 
 from atlantis_exp.build import build_network_actor, described
 from atlantis_exp.checking import nearest, parse, to_dict
+from atlantis_exp.comparison.decision import mean_interval
 from atlantis_exp.components import admitted
 from atlantis_exp.config import STRICT, Config, EvaluationConfig, PathsConfig
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.files import ARTIFACT, SMALL, read_file, read_object, write_file
 from atlantis_exp.sessions.processor import set_up_torch
-from atlantis_exp.statistics import interval, resample, summarize
+from atlantis_exp.statistics import summarize
 from atlantis_exp.training.actor import Actor
 from atlantis_exp.training.evaluation import Evaluation
 
 SINGLE = 8_000_000  # bytes; larger weights are written in half precision, to keep repositories small
 
 _COLUMNS = ("mean", "95 % interval", "median", "IQM", "high", "low", "episodes", "epsilon", "seed")
-_RESAMPLES = 10_000  # bootstrap samples
-_RESAMPLED = 10_000  # episodes at most
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -141,12 +140,9 @@ def side_by_side(card: Card, settings: EvaluationConfig, scores: Sequence[float]
 def _points(settings: EvaluationConfig, scores: Sequence[float]) -> Iterator[str]:
     """Yield the cells of `_COLUMNS`; the interval is of the mean, over episodes."""
     summary = summarize(scores)
-    low, high = summary.mean - 1.96 * summary.standard_error, summary.mean + 1.96 * summary.standard_error
-    if len(scores) <= _RESAMPLED:  # for more, the bootstrap takes minutes and gives the same
-        samples = resample([np.array(scores)], _RESAMPLES, np.random.default_rng(0))
-        low, high = interval([float(sample.mean()) for sample in samples])
+    low, high = mean_interval(scores)
     yield f"{summary.mean:,.0f}"
-    yield f"{low:,.0f} to {high:,.0f}"
+    yield f"{low:,.0f} to {high:,.0f}" if len(scores) > 1 else ""
     yield from (f"{point:,.0f}" for point in (summary.median, summary.interquartile_mean, summary.high, summary.low))
     yield from (str(setting) for setting in (summary.episodes, settings.epsilon, settings.seed))
 
@@ -201,8 +197,8 @@ Weights of a network that plays Atari {card.config.env.title}: {what}.
 | {" | ".join(_points(card.evaluation, card.scores))} |
 
 Played with the weights of this folder, in float32{otherwise}.
-The interval is the bootstrap's 95 % of the mean over these episodes; it says nothing of
-trainings with other seeds. The network's policy: {evaluation.policy}.
+The interval is Student's 95 % of the mean over these episodes; it says nothing of trainings
+with other seeds. The network's policy: {evaluation.policy}.
 
     {evaluation.report().replace(chr(10), chr(10) + "    ")}
 

@@ -65,8 +65,7 @@ def compare(
 
     The same question of more seeds is the same comparison: its folder holds the looks taken so far.
 
-    Raises:
-        ConfigError: if there is nothing to compare, the runs' protocols differ, or no group is the baseline.
+    Raises: ConfigError if there is nothing to compare, the runs' protocols differ, or no group is the baseline.
     """
     outputs = choice.outputs
     if choice.scores is None:

@@ -20,7 +20,7 @@ from rich.table import Table
 from torch import nn
 
 from atlantis_exp import documents, terminal
-from atlantis_exp.build import build_component, build_memory, build_trainer, import_components, make_emulator
+from atlantis_exp.build import build_component, build_memory, import_components, make_emulator
 from atlantis_exp.config import ComponentConfig, Config
 from atlantis_exp.faults import Fault
 from atlantis_exp.learning.learner import Learner
@@ -30,14 +30,11 @@ from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
 from atlantis_exp.networks.sizes import count_parameters
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job, replaced
-from atlantis_exp.sessions.processor import set_up_torch
-from atlantis_exp.sessions.training import expected
+from atlantis_exp.sessions.training import measure
+from atlantis_exp.tracking.store import first_line
 from atlantis_exp.training.checkpoint import Checkpoints, to_safetensors
 from atlantis_exp.training.fingerprint import fingerprint
-from atlantis_exp.training.plan import Counters
-from atlantis_exp.training.progress import Progress
 
 Contract = tuple[str, str, Callable[[], object]]
 """A component, its contract, and a call that raises if the contract is broken."""
@@ -61,9 +58,7 @@ def check(contracts: Iterator[Contract], measured: Mapping[str, Job]) -> None:
             try:
                 trial()
             except Exception as error:
-                kind = "" if isinstance(error, Fault) else f"{type(error).__name__}: "
-                because = kind + next((line for line in str(error).splitlines() if line.strip()), "")
-                because = because or "no reason given"
+                because = first_line(error) or repr(error)
             tried.append(documents.Trial(component=part, contract=contract, kept=not because, because=because))
     table = Table("component", "contract", "", "because")
     for each in tried:
@@ -72,8 +67,7 @@ def check(contracts: Iterator[Contract], measured: Mapping[str, Job]) -> None:
     broken = [f"{each.component}: {each.contract}" for each in tried if not each.kept]
     costs = list[documents.Cost]()
     if measured and not broken:
-        with terminal.working("measuring costs", lambda: f"{len(costs) + 1} of {len(measured)}"):
-            costs.extend(_cost(name, job) for name, job in measured.items())
+        costs = [_cost(name, job) for name, job in measured.items()]
         terminal.console(least=120).print(_table(costs))
     terminal.document(documents.Check(trials=tried, costs=costs).model_dump_json())
     if broken:
@@ -314,19 +308,13 @@ def fingerprints(config: Config, outputs: Path) -> dict[str, str]:
 
 def _cost(name: str, job: Job) -> documents.Cost:
     """Measure a training on this machine; an update includes the draw of its batch."""
-    config = job.config
-    set_up_torch(config, config.device)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder)
-        trainer = build_trainer(config, job.machine.cores, path, Journal(path), Progress(terminal.console()))
-        with trainer.emulators:
-            speed = expected(trainer, config, Counters())
-    size, batch = config.env.size, config.training.batch_size
+    trainer, speed = measure(job)
+    size, batch = job.config.env.size, job.config.training.batch_size
     return documents.Cost(
         component=name,
         pixels=size,
         parameters=count_parameters(trainer.learner.network),
-        flops_per_sample=trainer.learner.update_flops((config.env.stack, size, size), batch) / batch,
+        flops_per_sample=trainer.learner.update_flops((job.config.env.stack, size, size), batch) / batch,
         updates_per_second=speed.updates_per_second,
         steps_per_second=speed.steps_per_second,
     )

@@ -32,8 +32,8 @@ from atlantis_exp.sessions.job import Job, command_line, labels, quoted, replace
 from atlantis_exp.sessions.launchers import BASIC, Launcher
 from atlantis_exp.sessions.launchers.joblib import fitting
 from atlantis_exp.sessions.page import opened, terminable
-from atlantis_exp.sessions.sweep import hours_of, how_many, sweep
-from atlantis_exp.sessions.training import train
+from atlantis_exp.sessions.sweep import how_many, sweep
+from atlantis_exp.sessions.training import measure, train
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.training.forecast import duration
 
@@ -50,9 +50,8 @@ class Contest:
         job_of: the training that overrides make.
         command: what continues it.
 
-    Raises:
-        ConfigError: two contenders are the same training, their scores would not mean the same, a run was trained for
-            longer, or the baseline is none of them.
+    Raises: ConfigError if two contenders are the same training, their scores would not mean the same, a run was trained
+    for longer, or the baseline is none of them.
     """
 
     def __init__(
@@ -143,9 +142,7 @@ class Contest:
     def comparing(self) -> str:
         """The command that compares the runs as they have been here, which spends no error and finds nothing else."""
         question = self.question
-        delta = None if question.delta is None else f"{question.delta:.12g}"
-        if question.delta is not None and question.relative:
-            delta = f"{100 * question.delta:.12g}%"
+        delta = question.delta and (f"{100 * question.delta:.12g}%" if question.relative else f"{question.delta:.12g}")
         return command_line(
             *("compare", f"by={','.join(question.by)}", f"runs={self.folder.name}", f"seeds={question.seeds}"),
             f"at_epsilon={self.config.evaluation.epsilon}",
@@ -213,8 +210,7 @@ def decide(contest: Contest, trained: Callable[[Job], int | None] | None = None)
 
     trained: trains a job in this process, one after the other; None: the contest's launcher does.
 
-    Raises:
-        Fault: a training fails; the same command goes on.
+    Raises: Fault if a training fails; the same command goes on.
     """
     tracking = contest.config.tracking
     again = f"the decision goes on with: {contest.command}"
@@ -275,7 +271,7 @@ def say_what_it_takes(contest: Contest) -> None:
         say(how_many(launcher))
     for label, runs in missing.items():
         if runs and contest.config.budget.forecast != "off":
-            forecast = hours_of(contest.job(label, 0), cores)
+            forecast = measure(contest.job(label, 0), cores)[1].hours
             hours += runs * forecast
             say(f"{label}: {duration(forecast)} a run, {'on its share' if cores else 'alone on this machine'}")
     if hours:

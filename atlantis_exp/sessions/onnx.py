@@ -50,8 +50,7 @@ def require() -> None:
 def export_onnx(config: Config, weights: bytes) -> Exported:
     """Return a network as ONNX: `states`, uint8 (batch, stack, size, size), to `q_values`, float32 (batch, actions).
 
-    Raises:
-        Fault: it cannot be written, or its values on states of a game are not torch's.
+    Raises: Fault if it cannot be written, or its values on states of a game are not torch's.
     """
     network = build_trained_network(config, weights).eval()
     shape = config.env.stack, config.env.size, config.env.size

@@ -50,8 +50,7 @@ def opened(
     prepare: called once the folder is held, before anything is published.
     others: runs of other processes that are published too.
 
-    Raises:
-        Fault: another process holds the folder, or its journal is damaged.
+    Raises: Fault if another process holds the folder, or its journal is damaged.
     """
     with folder.held():
         prepare()

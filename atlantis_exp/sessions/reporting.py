@@ -22,7 +22,8 @@ def report(outputs: Path, runs: Sequence[str] = (), where: Sequence[str] = ()) -
     """
     catch_up(outputs)
     folders = _chosen(outputs, runs, where)
-    terminal.document(Report(runs=[_reported(run) for run in folders]).model_dump_json())
+    reported = [_reported(run) for run in folders]
+    terminal.document(Report(runs=reported).model_dump_json())
     if not folders:
         print(f"there is no {'such ' if runs or where else ''}run under {outputs / 'runs'} yet")
         return
@@ -31,31 +32,26 @@ def report(outputs: Path, runs: Sequence[str] = (), where: Sequence[str] = ()) -
     table = Table(*columns, title=f"last evaluations of the runs in {shown}")
     for column in table.columns[1:]:
         column.justify = "right"
-    for run in folders:
-        if (result := run.final_result) is not None:
-            earlier = f" (evaluated at {result.evaluated_at:,})" if result.evaluated_at is not None else ""
-            table.add_row(run.name, f"{result.steps:,}{earlier}", *_cells(result.evaluation))
-        else:
-            step, evaluation = _last_evaluation(run)
-            table.add_row(run.name, f"{step:,} ({run.state})" if evaluation else run.state, *_cells(evaluation))
+    for each in reported:
+        earlier = f" (evaluated at {each.evaluated_at:,})" if each.evaluated_at not in (None, each.steps) else ""
+        steps = f"{each.steps:,}{earlier if each.state == 'done' else f' ({each.state})'}"
+        table.add_row(each.run, steps if each.evaluation or each.state == "done" else each.state, *_cells(each))
     console = terminal.console(least=150)
     console.print(table)
     console.print(how_to_open(outputs), end="", soft_wrap=True)  # a command to copy
 
 
 def _reported(run: RunFolder) -> Reported:
-    result = run.final_result
-    if result is None:
+    if (result := run.final_result) is None:
         steps, evaluation = _last_evaluation(run)
-        at = steps
+        at: int | None = steps
     else:
-        steps, evaluation = result.steps, result.evaluation
-        at = steps if result.evaluated_at is None else result.evaluated_at
+        steps, evaluation, at = result.steps, result.evaluation, result.evaluated_at
     return Reported(
         run=run.name,
         state=run.state,
         steps=steps,
-        evaluated_at=at if evaluation else None,
+        evaluated_at=(steps if at is None else at) if evaluation else None,
         evaluation={key: value for key, value in evaluation.items() if isfinite(value)},
     )
 
@@ -88,8 +84,8 @@ def _last_evaluation(run: RunFolder) -> tuple[int, Mapping[str, float]]:
     return found
 
 
-def _cells(evaluation: Mapping[str, float]) -> list[str]:
-    if not evaluation:
+def _cells(reported: Reported) -> list[str]:
+    if not (evaluation := reported.evaluation):
         return []
     return [
         *(f"{evaluation[f'evaluation/{point}']:,.0f}" for point in TABLE_COLUMNS),

@@ -41,6 +41,7 @@ from atlantis_exp.sessions.job import Job, command_line, fitted, labels, replace
 from atlantis_exp.sessions.page import ending, opened
 from atlantis_exp.sessions.stopping import StopRequest
 from atlantis_exp.sessions.training import train
+from atlantis_exp.tracking.store import first_line
 from atlantis_exp.training.trainer import Trainer
 
 _WAIT_SECONDS = 2.0  # between two looks at the trials of other processes
@@ -198,7 +199,7 @@ class Trials:
                 raise  # of the machine: every trial would fail
             if not isinstance(error, Fault):
                 traceback.print_exc()
-            trial.set_user_attr("error", str(error) if isinstance(error, Fault) else f"{type(error).__name__}: {error}")
+            trial.set_user_attr("error", first_line(error))
             self.study.tell(trial.number, state=TrialState.FAIL)
         print(f"\ntrial {trial.number}: {_described(self.all[trial.number])}; {self.counts()}\n", flush=True)
 

@@ -1,37 +1,28 @@
 """A sweep as a run of its own that its trainings are shown under, with their table on its page."""
 
-import csv
-import io
-import tempfile
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
-from dataclasses import replace
 from functools import partial
 from math import ceil
 from pathlib import Path
 from typing import Any, get_args
 
-from rich.console import Console
-
 from atlantis_exp import terminal
-from atlantis_exp.build import build_trainer
 from atlantis_exp.checking import digest
+from atlantis_exp.comparison.tables import to_csv
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import TABLE_COLUMNS, TRACEBACK, RunFolder, State, has_ended
-from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, Tracker, adopt
+from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Status, adopt
 from atlantis_exp.sessions.job import Job, fitted
 from atlantis_exp.sessions.launchers import BASIC, Launcher, in_turn
 from atlantis_exp.sessions.launchers.joblib import train_side_by_side
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.page import ending, opened, terminable
-from atlantis_exp.sessions.processor import set_up_torch
-from atlantis_exp.sessions.training import expected, train
+from atlantis_exp.sessions.training import measure, train
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.training.forecast import duration
-from atlantis_exp.training.plan import Counters
-from atlantis_exp.training.progress import Progress
 
 _PAGE_SECONDS = 60.0  # between two looks at the runs while they are trained
 
@@ -55,8 +46,7 @@ def sweep(
         on_a_node: trains a job of these overrides in a process of Slurm's.
         train: trains a job in this process.
 
-    Raises:
-        Fault: another process runs the same sweep, or a training failed, once all have ended.
+    Raises: Fault if another process runs the same sweep, or a training failed, once all have ended.
     """
     with ledger(jobs, swept, launcher, command):
         match launcher.name:
@@ -98,7 +88,7 @@ def say_hours(jobs: Sequence[Job], launcher: Launcher) -> None:
     at_once = min(launcher.settings.get("n_jobs", 1), len(left))
     hours = ""
     if left[0].config.budget.forecast != "off":
-        each = hours_of(left[0], launcher.settings.get("cores"))
+        each = measure(left[0], launcher.settings.get("cores"))[1].hours
         hours = f": about {duration(each * ceil(len(left) / at_once))} if all take as long as {left[0].title}"
     print(f"{how_many(launcher)}{hours}", flush=True)
 
@@ -109,20 +99,6 @@ def how_many(launcher: Launcher) -> str:
         return "one training after the other"
     cores = launcher.settings["cores"]
     return f"{launcher.settings['n_jobs']} trainings at a time, {cores} {'core' if cores == 1 else 'cores'} each"
-
-
-def hours_of(job: Job, cores: int | None = None) -> float:
-    """Return the hours that a training takes here with so many cores; None: with this process's."""
-    config = replace(job.config, threads=job.config.threads or cores)
-    set_up_torch(config, config.device)
-    with (
-        tempfile.TemporaryDirectory() as aside,
-        terminal.working("measuring how fast it goes here"),
-    ):
-        progress = Progress(Console(quiet=True))
-        trainer = build_trainer(config, cores or job.machine.cores, Path(aside), Tracker(), progress)
-        with trainer.emulators:
-            return expected(trainer, config, Counters()).hours
 
 
 def _print_table(runs: Runs) -> None:
@@ -240,8 +216,4 @@ def _tabulate(journal: Journal, runs: Runs) -> None:
         result = folder.result
         numbers = {"steps": result.steps, **result.counts, **result.evaluation} if result else {}
         rows.append({"run": folder.name, "title": job.title, "state": folder.state, **numbers})
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    journal.artifact("runs.csv", text.getvalue().encode())
+    journal.artifact("runs.csv", to_csv(rows).encode())

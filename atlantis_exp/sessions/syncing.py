@@ -34,9 +34,8 @@ def sync(
 ) -> None:
     """Publish all run folders, once or until interrupted; print a line a run that changed, and counts.
 
-    Raises:
-        Fault: if the store cannot be reached or a run failed; with `every`, given as `seconds` too, that is printed,
-            and tried again.
+    Raises: Fault if the store cannot be reached or a run failed; with `every`, given as `seconds` too, that is printed,
+    and tried again.
     """
     outputs = Path(paths.outputs)
     store = Store(outputs, tracking.experiment, to or tracking.uri)

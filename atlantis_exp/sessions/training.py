@@ -2,6 +2,7 @@
 
 import dataclasses
 import signal
+import tempfile
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rich.console import Console
 
 from atlantis_exp import terminal
 from atlantis_exp.build import build_trained_network, build_trainer, choose_device, described, import_components
@@ -18,7 +20,7 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault, RunFault, in_words
 from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import CONFIG, LOST, TRACEBACK, Result, RunFolder, all_runs
-from atlantis_exp.runs.journal import Journal, adopt, has_lost_commit
+from atlantis_exp.runs.journal import Journal, Tracker, adopt, has_lost_commit
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.cards import read_card
 from atlantis_exp.sessions.job import Job, command_line, labels, replaced
@@ -140,14 +142,13 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
         state = trainer.checkpoints.load(trainer.memory, progress.say)
     folder.write_config(to_dict(config))
     done = Counters()
-    if state is not None:
-        with unforged(folder.checkpoints):
-            done = Counters.of(state["counters"])
     if state is None:
         if (weights := _initial_weights(config)) is not None:
             trainer.learner.begin_with(weights)
         progress.say(f"starting run {folder.name} in {folder.path}{_kin(job, folder)}")
     else:
+        with unforged(folder.checkpoints):
+            done = Counters.of(state["counters"])
         progress.say(f"continuing run {folder.name} at step {done.steps:,}")
     if config.budget.forecast != "off":
         # Before there is anything to publish: MLflow's import at the same time took three quarters of the speed.
@@ -204,7 +205,18 @@ def _begin_with(job: Job, folder: RunFolder) -> str:
     return f"To begin a training with its weights:\n  {export}\n  {begin}"
 
 
-def expected(trainer: Trainer, config: Config, done: Counters) -> Forecast:
+def measure(job: Job, cores: int | None = None) -> tuple[Trainer, Forecast]:
+    """Return a training that is not begun, and its cost here with so many cores; None: with this process's."""
+    config = dataclasses.replace(job.config, threads=job.config.threads or cores)
+    set_up_torch(config, config.device)
+    with terminal.working("measuring how fast it goes here"), tempfile.TemporaryDirectory() as aside:
+        progress = Progress(Console(quiet=True))
+        trainer = build_trainer(config, cores or job.machine.cores, Path(aside), Tracker(), progress)
+        with trainer.emulators:
+            return trainer, _expected(trainer, config, Counters())
+
+
+def _expected(trainer: Trainer, config: Config, done: Counters) -> Forecast:
     """Return the cost of the rest of a training here, and leave its parts as they are."""
     return forecast(
         trainer,
@@ -218,7 +230,7 @@ def expected(trainer: Trainer, config: Config, done: Counters) -> Forecast:
 
 def _check_forecast(trainer: Trainer, config: Config, done: Counters, progress: Progress) -> None:
     with terminal.working("measuring how fast it goes here"):
-        cost = expected(trainer, config, done)
+        cost = _expected(trainer, config, done)
     progress.say(str(cost))
     if cost.shortage is not None:
         if config.budget.forecast == "refuse":

@@ -1,13 +1,12 @@
 """The config groups: every option and preset composes, and means what the documents say."""
 
-import json
 from functools import cache
 from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
 
-from atlantis_exp.checking import flatten, parse, to_dict
+from atlantis_exp.checking import flatten, to_dict
 from atlantis_exp.commands import CONF
 from atlantis_exp.commands.composing import checked
 from atlantis_exp.config import Config
@@ -83,10 +82,3 @@ def test_an_outputs_folder_is_made_absolute_and_a_checkout_keeps_its_own(
     monkeypatch.chdir(tmp_path)
     assert composed("paths.outputs=o").paths.outputs == str(tmp_path / "o")
     assert composed().paths.outputs == str(CONF.parent / "outputs")
-
-
-def test_a_config_survives_json(tmp_path: Path) -> None:
-    config = composed("experiment=paper_resnet", f"paths.outputs={tmp_path}", "env.num_envs=3", "threads=2")
-    stored = parse(Config, json.loads(json.dumps(to_dict(config))))
-    assert stored == config
-    assert stored.identity() == config.identity()

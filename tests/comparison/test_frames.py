@@ -16,12 +16,10 @@ import pandas as pd
 import pytest
 
 from atlantis_exp import load_runs
-from atlantis_exp.checking import to_dict
 from atlantis_exp.comparison.estimands import score_of
 from atlantis_exp.comparison.export_tables import UNITS
 from atlantis_exp.comparison.gather import gather
 from atlantis_exp.components import facts_of, game_of
-from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal
@@ -287,14 +285,6 @@ def test_every_frame_survives_parquet(recorded: Recorded, tmp_path: Path) -> Non
         pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / f"{name}.parquet"), frame, check_dtype=False)
 
 
-def test_the_config_is_all_there(recorded: Recorded, tiny: Callable[..., Config], tmp_path: Path) -> None:
-    recorded("seed=3")
-    columns = set(load_runs(tmp_path).runs.columns)
-    config = to_dict(tiny("seed=3"))
-    assert {f"training.{key}" for key in config["training"]} <= columns
-    assert {f"evaluation.{key}" for key in config["evaluation"]} <= columns
-
-
 @pytest.mark.parametrize("points", [2, 1, 0])  # of a curve; none before the first episode ends
 def test_the_example_of_the_page_runs(
     recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, points: int
@@ -345,13 +335,6 @@ def test_the_package_is_imported_without_pandas() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
     code = "import sys; from atlantis_exp import load_runs; assert not {'pandas', 'torch', 'mlflow'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_a_name_that_the_package_does_not_have_is_an_error() -> None:
-    import atlantis_exp
-
-    with pytest.raises(AttributeError, match="no attribute 'load_run'"):
-        atlantis_exp.load_run  # noqa: B018
 
 
 def test_the_score_of_a_run_is_that_of_its_comparison(recorded: Recorded, tmp_path: Path) -> None:

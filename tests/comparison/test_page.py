@@ -14,12 +14,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from atlantis_exp.comparison.choosing import group
 from atlantis_exp.comparison.figures import Drawn, draw
-from atlantis_exp.comparison.gather import gather
 from atlantis_exp.comparison.page import number, page, plain
-from atlantis_exp.comparison.tables import Comparison, compare
-from atlantis_exp.comparison.verdict import Question
+from atlantis_exp.comparison.tables import Comparison
+from tests.comparison.folders import compared_by
 
 Recorded = Callable[..., Path]
 
@@ -30,8 +28,7 @@ def comparison(recorded: Recorded, tmp_path: Path) -> Comparison:
         recorded("model=cnn", f"seed={seed}", scores=(1_000.0 + seed, 2_345.0, 3_100.0, 700.0))
         recorded("model=resnet", f"seed={seed}", scores=(8_000.0 + seed, 9_876.0, 9_100.0, 8_700.0))
     (tmp_path / "runs" / "<script>alert(1)<").mkdir()
-    gathered = gather(tmp_path)
-    return compare(gathered, group(gathered.trainings, ["model"]), Question(["model"]))
+    return compared_by(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +103,6 @@ def test_the_page_says_the_verdict_the_notes_and_every_shown_table(
         assert row["name"] in text
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("score", "title"), [("last", "IQM"), ("training", "training score"), ("given", "score")])
 def test_a_column_of_scores_says_which_they_are(comparison: Comparison, score: Any, title: str) -> None:
     asked = replace(comparison, question=replace(comparison.question, score=score))
@@ -116,10 +112,10 @@ def test_a_column_of_scores_says_which_they_are(comparison: Comparison, score: A
     assert sum(f">{title}</th>" in head and ">run</th>" in head for head in heads) == 1
 
 
+@pytest.mark.slow
 def test_scores_within_a_decade_are_marked_in_thousands(recorded: Recorded, tmp_path: Path) -> None:
     recorded(scores=(2_100.0, 5_200.0))
-    gathered = gather(tmp_path)
-    svg = draw(compare(gathered, group(gathered.trainings, ["model"]), Question(["model"])))["profile"].svg
+    svg = draw(compared_by(tmp_path))["profile"].svg
     assert "mathdefault" not in svg
     assert {">3k<", ">4k<"} <= set(re.findall(r">[0-9.]+k<", svg))
 
@@ -130,8 +126,7 @@ def test_two_bands_at_most_lie_over_each_other(recorded: Recorded, tmp_path: Pat
         for seed in range(5):
             points = [(0, 0, 0, 1_000 + seed), (600, 0.5, 30, 2_000 + 1_000 * index + 10 * seed)]
             recorded(f"model={model}", f"seed={seed}", curve=points)
-    gathered = gather(tmp_path)
-    figures = draw(compare(gathered, group(gathered.trainings, ["model"]), Question(["model"])))
+    figures = draw(compared_by(tmp_path))
     bands = set(re.findall(r'id="(?:FillBetween)?PolyCollection_\d+"', figures["learning_frames"].svg))
     assert len(bands) == 2
 
@@ -178,8 +173,7 @@ def test_published_curves_leave_the_picture_rather_than_flatten_what_was_trained
     recorded: Recorded, tmp_path: Path
 ) -> None:
     recorded(curve=[(0, 0, 0, 4_000), (12_000_000, 9, 9, 9_000)])  # where others have 866,604
-    gathered = gather(tmp_path)
-    figure = draw(compare(gathered, group(gathered.trainings, ["model"]), Question(["model"])))["learning_frames"]
+    figure = draw(compared_by(tmp_path))["learning_frames"]
     assert all(f"{name}, published" in figure.svg for name in ("QR-DQN Impala ResNet", "DreamerV3", "PPO"))
     assert set(re.findall(r">(\d+k)<", figure.svg)) <= {f"{number}k" for number in range(31)}
     pixels = np.asarray(Image.open(io.BytesIO(figure.png)).convert("RGB"))
@@ -198,8 +192,7 @@ def test_the_same_comparison_draws_the_same_figures(comparison: Comparison) -> N
 @pytest.mark.slow
 def test_a_comparison_without_curves_has_the_other_figures(recorded: Recorded, tmp_path: Path) -> None:
     recorded(curve=())
-    gathered = gather(tmp_path)
-    comparison = compare(gathered, group(gathered.trainings, ["model"]), Question(["model"]))
+    comparison = compared_by(tmp_path)
     figures = draw(comparison)
     assert list(figures) == ["scores", "why", "distribution", "profile", "actions", "references"]
     assert "three fair views" not in page(comparison, figures, {})

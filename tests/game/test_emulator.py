@@ -125,18 +125,6 @@ def test_frames_left_in_the_pool_by_an_unfinished_step_are_those_of_atari_prepro
 
 
 @pytest.mark.slow
-def test_a_held_button_scores_two_thousand_points() -> None:
-    ours = emulator()
-    for action in range(4):
-        ours.reset(seed=action)
-        score, step = 0.0, ours.step(action)
-        while not step.terminated:
-            score += step.reward
-            step = ours.step(action)
-        assert score + step.reward == 2_000
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("actions", "never", "seed", "bonuses"),
     [

@@ -125,14 +125,6 @@ def test_saved_emulators_play_on_under_any_number_of_workers(emulators: Emulator
         assert_all_equal(play(restored, 100, seed=3), played)
 
 
-def test_a_step_can_be_sent_and_received_later(emulators: Emulators) -> None:
-    state = emulators.state_dict()
-    emulators.send([1, 2], [2, 0])
-    later = emulators.receive()
-    emulators.load_state_dict(state)
-    assert_equal(later, emulators.step([1, 2], [2, 0]))
-
-
 def test_steps_of_other_environments_can_be_under_way(emulators: Emulators) -> None:
     state = emulators.state_dict()
     emulators.send([1, 2], [2, 0])
@@ -246,14 +238,6 @@ def test_an_exception_in_a_worker_is_told(mortal: tuple[ProcessEmulators, list[i
 def test_what_make_raises_is_raised() -> None:
     with pytest.raises(ValueError, match="max_pool"):
         ProcessEmulators(functools.partial(make, max_pool=True, frameskip=1), 2, 2)
-
-
-def test_workers_leave_signals_to_the_parent(two_workers: ProcessEmulators) -> None:
-    two_workers.reset(range(NUM_ENVS))
-    for number in SIGNALS:
-        for pid in workers_of_this_process():
-            os.kill(pid, number)
-        two_workers.step([0] * NUM_ENVS)
 
 
 def test_workers_leave_signals_to_the_parent_from_their_start_on() -> None:

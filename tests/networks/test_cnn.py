@@ -1,6 +1,5 @@
 import pytest
 import torch
-from torch import nn
 
 from atlantis_exp.networks.cnn import DQNCnn
 from atlantis_exp.networks.sizes import count_parameters
@@ -22,18 +21,6 @@ def test_the_layers_are_those_of_figure_2_1() -> None:
     ]
 
 
-def test_84_pixels_a_side_become_7_as_commented_in_figure_2_1() -> None:
-    features = DQNCnn((4, 84, 84), 4).features
-    sides = [84]
-    x = torch.zeros(1, 4, 84, 84)
-    for layer in features:
-        x = layer(x)
-        if isinstance(layer, nn.Conv2d):
-            sides.append(x.shape[2])
-    assert sides == [84, 20, 9, 7]
-    assert x.shape == (1, 64 * 7 * 7)
-
-
 def test_it_has_as_many_parameters_as_its_layers_add_up_to() -> None:
     # (4*8*8+1)*32 + (32*4*4+1)*64 + (64*3*3+1)*64 + (3136+1)*512 + (512+1)*4
     assert count_parameters(DQNCnn((4, 84, 84), 4)) == 8_224 + 32_832 + 36_928 + 1_606_144 + 2_052 == 1_686_180
@@ -53,9 +40,3 @@ def test_it_computes_the_composition_of_its_layers() -> None:
 @pytest.mark.parametrize(("height", "width"), [(36, 36), (36, 61), (100, 40)])
 def test_it_takes_other_sizes_down_to_the_smallest(height: int, width: int) -> None:
     assert DQNCnn((3, height, width), 6)(torch.zeros(2, 3, height, width)).shape == (2, 6)
-
-
-@pytest.mark.parametrize(("height", "width"), [(35, 84), (84, 35)])
-def test_smaller_sizes_are_refused_in_a_sentence(height: int, width: int) -> None:
-    with pytest.raises(ValueError, match=f"DQNCnn needs 36 pixels a side at least, not {height}x{width}"):
-        DQNCnn((4, height, width), 4)

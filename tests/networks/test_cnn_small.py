@@ -22,8 +22,3 @@ def test_the_layers_are_those_of_section_4_1() -> None:
 @pytest.mark.parametrize(("height", "width"), [(20, 20), (21, 61), (100, 40)])
 def test_it_takes_other_sizes_down_to_the_smallest(height: int, width: int) -> None:
     assert SmallCnn((3, height, width), 6)(torch.zeros(2, 3, height, width)).shape == (2, 6)
-
-
-def test_smaller_sizes_are_refused_in_a_sentence() -> None:
-    with pytest.raises(ValueError, match="SmallCnn needs 20 pixels a side at least, not 19x84"):
-        SmallCnn((4, 19, 84), 4)

@@ -39,14 +39,6 @@ def test_masks_follow_the_seed_and_differ_from_call_to_call() -> None:
     assert not torch.equal(first, other(x))
 
 
-def test_a_restored_stream_continues_where_it_was_saved() -> None:
-    x = torch.ones(1000)
-    dropout, fresh = _seeded(0.2, 5), Dropout(0.2)
-    dropout(x)
-    fresh.generator.set_state(dropout.generator.get_state())
-    assert torch.equal(dropout(x), fresh(x))
-
-
 def test_the_global_generator_is_neither_read_nor_moved() -> None:
     x = torch.ones(1000)
     with torch.random.fork_rng():

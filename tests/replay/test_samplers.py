@@ -41,17 +41,6 @@ def test_top_half_is_the_sorted_draw_cut_to_the_batch(oversample: int) -> None:
         assert ids.tolist() == expected
 
 
-def test_top_half_doubles_the_share_of_rare_rewards() -> None:
-    rewards = np.zeros(1_000)
-    rewards[::50] = 100.0  # 2 % of steps, as random play in Atlantis
-    memory = memory_with_rewards(rewards)
-    uniform, top_half = (
-        np.count_nonzero(memory.rewards(sampler.sample(memory, 10_000, np.random.default_rng(1)).ids))
-        for sampler in (UniformSampler(), TopHalfSampler(2))
-    )
-    assert 1.8 < top_half / uniform < 2.2
-
-
 @pytest.mark.parametrize(("sampler", "drawn"), [(UniformSampler(), 8), (TopHalfSampler(2), 16)])
 def test_a_sampler_chooses_before_any_frame_is_decoded(
     sampler: Sampler, drawn: int, monkeypatch: pytest.MonkeyPatch

@@ -2,7 +2,6 @@ import hashlib
 import json
 import math
 import os
-import re
 import resource
 import shutil
 import time
@@ -256,19 +255,6 @@ def test_time_never_runs_backwards_with_the_clock_nor_across_sessions(
     assert [record.time for record in records(tmp_path) if isinstance(record, Metrics)] == [5_000, 5_000, 6_000, 6_000]
 
 
-def test_a_torn_last_line_is_not_read_and_not_kept(tmp_path: Path) -> None:
-    state = journaled(tmp_path, 1, 2)
-    with open(tmp_path / "journal.jsonl", "ab") as file:
-        file.write(b'{"kind":"metrics","step":3,"ti')
-    assert steps(tmp_path) == [1, 2]
-    journal = Journal(tmp_path)
-    journal.load_state_dict(state)
-    journal.metrics({"score": 3}, 3)
-    journal.state_dict()
-    journal.commit()
-    assert steps(tmp_path) == [1, 2, 3]
-
-
 def test_a_journal_cut_below_its_commit_is_refused(tmp_path: Path) -> None:
     state = journaled(tmp_path, 1, 2)
     os.truncate(tmp_path / "journal.jsonl", state["offset"] - 5)
@@ -396,8 +382,8 @@ def test_a_hard_link_in_a_run_folder_is_not_written_through(tmp_path: Path, name
 
 
 @pytest.mark.parametrize("field", ["offset", "started", "updated"])
-@pytest.mark.parametrize("number", [-5, 2**63])
-def test_a_commit_out_of_range_is_refused(tmp_path: Path, field: str, number: int) -> None:
+@pytest.mark.parametrize("number", [-5, 2**63, "1"])
+def test_a_commit_out_of_range_is_refused(tmp_path: Path, field: str, number: int | str) -> None:
     journaled(tmp_path, 1)
     commit = json.loads((tmp_path / "commit.json").read_bytes())
     (tmp_path / "commit.json").write_text(json.dumps({**commit, field: number}))
@@ -481,14 +467,6 @@ def test_without_its_commit_a_journal_is_found_to_have_lost_it_and_its_whole_lin
     commit = read_commit(tmp_path)
     assert commit is not None
     assert (commit.status, steps(tmp_path), has_lost_commit(tmp_path)) == ("FINISHED", [0, 1, 2], False)
-
-
-def test_a_commit_with_a_number_in_quotes_is_damaged(tmp_path: Path) -> None:
-    journaled(tmp_path, 1)
-    path = tmp_path / "commit.json"
-    path.write_text(re.sub(r'"offset":(\d+)', r'"offset":"\1"', path.read_text()))
-    with pytest.raises(JournalError, match="is damaged"):
-        read_commit(tmp_path)
 
 
 def test_labels_and_errors_hold_from_the_first_moment_and_across_sessions(tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ import pytest
 
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import write_file
-from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.lock import alone, held, is_held
 
 REPOSITORY = Path(__file__).parents[2]
@@ -108,13 +107,6 @@ def test_a_folder_is_waited_for(tmp_path: Path) -> None:
             assert is_held(tmp_path)
 
 
-def test_a_holder_that_has_not_said_its_name_is_another_process(tmp_path: Path) -> None:
-    with holder(tmp_path):
-        (tmp_path / "holder.txt").unlink()
-        with pytest.raises(Fault, match=r"^run x is held by another process$"), held(tmp_path, "run x", 0.0):
-            pass
-
-
 def test_a_folder_is_held_against_this_process_too_until_the_block_ends_however_it_does(tmp_path: Path) -> None:
     folder = tmp_path / "runs" / "x"
     assert not is_held(folder)
@@ -125,17 +117,6 @@ def test_a_folder_is_held_against_this_process_too_until_the_block_ends_however_
             pass
         raise KeyError
     assert not is_held(folder)
-
-
-def test_a_run_folder_names_itself(tmp_path: Path) -> None:
-    folder = RunFolder(tmp_path / "cnn-0")
-    with holder(folder.path) as process:
-        assert folder.is_held
-        with pytest.raises(Fault, match=f"^run cnn-0 is held by process {process.pid} on "), folder.held():
-            pass
-    assert not folder.is_held
-    with folder.held():
-        assert folder.is_held
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ import dataclasses
 import hashlib
 import json
 import os
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ from atlantis_exp.commands.evaluate import EvaluateConfig
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
-from atlantis_exp.sessions import cards
 from atlantis_exp.sessions.cards import Card, pack, portable
 
 Command = Callable[..., int]
@@ -148,19 +146,6 @@ def test_weights_that_are_not_numbers_are_not_played(
     (folder / "card.json").write_text(json.dumps({**card, "sha256": hashlib.sha256(weights).hexdigest()}))
     assert command("evaluate", f"weights={folder}", f"paths.outputs={folder.parent}/o") == 1
     assert "the weights are not all finite numbers" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("episodes", [10_000, 10_001, 1_000_000])
-def test_the_interval_of_a_card_of_many_episodes_takes_seconds(tiny: Compose, episodes: int) -> None:
-    scores = np.random.default_rng(0).normal(1_000, 100, episodes).tolist()
-    began = time.process_time()
-    mean, interval, *_ = cards._points(tiny().evaluation, scores)
-    low, high = map(float, interval.replace(",", "").split(" to "))
-    half = 1.96 * 100 / episodes**0.5
-    assert low == pytest.approx(float(mean.replace(",", "")) - half, abs=1.1)
-    assert high == pytest.approx(float(mean.replace(",", "")) + half, abs=1.1)
-    assert time.process_time() - began < 60
 
 
 def test_a_misspelt_folder_and_a_run_beside_a_folder_are_one_line(

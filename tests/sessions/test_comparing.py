@@ -90,14 +90,6 @@ def test_a_comparison_of_more_seeds_goes_on_in_its_run_and_one_that_fails_says_s
 
 
 @pytest.mark.slow
-def test_the_same_comparison_again_is_the_same_run(recorded: Recorded, tmp_path: Path) -> None:
-    recorded()
-    for _ in range(2):
-        VERB.run([f"paths.outputs={tmp_path}", "tracking=none"])
-    assert len(list((tmp_path / "comparisons").iterdir())) == 1
-
-
-@pytest.mark.slow
 def test_what_follows_from_the_seed_makes_no_other_comparison_and_another_recipe_does(
     recorded: Recorded, tmp_path: Path
 ) -> None:

@@ -18,11 +18,10 @@ from atlantis_exp.commands.compare import CompareConfig
 from atlantis_exp.commands.decide import VERB as DECIDE
 from atlantis_exp.commands.decide import DecideConfig, contest_of
 from atlantis_exp.commands.overrides import check
-from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.machine import all_cores
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import NOTE, Tags, read_commit
+from atlantis_exp.runs.journal import NOTE, Tags
 from atlantis_exp.sessions.deciding import Contest, decide, say_what_it_takes
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.launchers import BASIC, Launcher
@@ -35,7 +34,6 @@ SHORT = (
 )
 CAPS = "env.max_steps=100,900"  # who plays longer scores more
 
-Compose = Callable[..., Config]
 Recorded = Callable[..., Path]
 Asking = Callable[..., Contest]
 
@@ -262,23 +260,6 @@ def test_contenders_are_asked_about_at_equal_arithmetic(asking: Asking, recorded
         asking("model=cnn,resnet", "budget.flops=3e3")
 
 
-@pytest.mark.slow
-def test_a_training_that_fails_ends_the_decision_in_one_line_that_says_how_it_goes_on(
-    asking: Asking, recorded: Recorded
-) -> None:
-    record_seeds(recorded, 1_000, range(5), "model=cnn")
-    record_seeds(recorded, 2_000, range(4), "model=resnet")
-    contest = asking("model=cnn,resnet", "seeds=5")
-    run = contest.run("resnet", 4)
-    run.path.mkdir(parents=True)
-    (run.path / "checkpoints").write_text("in the way")
-    with pytest.raises(Fault) as failed:
-        decide(contest)
-    assert str(failed.value).startswith(f"run {run.name}: ")
-    assert str(failed.value).endswith(f"; the decision goes on with: {contest.command}")
-    assert contest.folder.status == "FAILED"
-
-
 def test_the_command_that_compares_is_read_as_it_is_meant(asking: Asking, tmp_path: Path) -> None:
     contest = asking("optimizer.lr=0.001,0.002", "baseline='lr=0.001'", "delta=1234567")
     words = shlex.split(contest.comparing)[4:]
@@ -407,42 +388,3 @@ def test_a_decision_that_was_killed_goes_on_and_ends_as_the_unbroken_one(
     for path in runs.glob("*/result.json"):
         other = json.loads((tmp_path / "unbroken" / path.relative_to(tmp_path / "o")).read_bytes())
         assert json.loads(path.read_bytes())["evaluation"] == other["evaluation"]
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(900)  # seconds
-def test_a_launcher_trains_what_the_decision_needs_with_a_sampler_from_a_file(
-    deciding: Callable[..., subprocess.Popen[str]], tmp_path: Path
-) -> None:
-    launcher = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
-    process = deciding(CAPS, "plugins=examples/paying.py", "sampler=paying", *launcher, "tracking=mlflow")
-    out, error = process.communicate()
-    assert process.returncode == 0, out + error
-    assert "max_steps=900 plays better than max_steps=100 by" in out
-    assert len(list((tmp_path / "o" / "runs").glob("*-paying-*/result.json"))) == 10
-    (decision,) = (tmp_path / "o" / "decisions").iterdir()
-    assert RunFolder(decision).status == "FINISHED"
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(900)  # seconds
-@pytest.mark.parametrize("launcher", [(), ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")])
-def test_the_end_of_a_decision_has_its_jobs_commit(
-    deciding: Callable[..., subprocess.Popen[str]], tmp_path: Path, launcher: tuple[str, ...]
-) -> None:
-    process = deciding(CAPS, "phase.quick.steps=100_000", "tracking.commit_seconds=0.5", *launcher)
-    folder = tmp_path / "o" / "runs"
-    patience = time.monotonic() + 200
-    while not any(
-        (commit := read_commit(path)) is not None and commit.offset for path in folder.glob("*") if path.is_dir()
-    ):
-        assert process.poll() is None
-        assert time.monotonic() < patience
-        time.sleep(0.1)
-    process.terminate()
-    out, error = process.communicate()
-    assert process.returncode == 143, out + error
-    assert "atlantis_exp: the decision goes on with: python -m atlantis_exp decide" in error
-    runs = [RunFolder(path) for path in folder.iterdir()]
-    assert not any(run.is_held for run in runs)
-    assert {run.state for run in runs} <= {"interrupted", "queued"}

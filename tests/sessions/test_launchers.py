@@ -302,22 +302,6 @@ def test_jobs_side_by_side_fail_and_are_killed_alone_and_the_same_command_runs_w
 
 
 @pytest.mark.slow
-def test_jobs_that_begin_anew_find_what_was_there_put_aside(
-    sweep: Sweep, seeds: Callable[..., list[Config]], tmp_path: Path
-) -> None:
-    words = (*FREQUENT, "phase.quick.steps=60")
-    command = (*words, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1,2", "resume=never")
-    for _ in range(2):
-        assert sweep(*command).wait(timeout=200) == 0, (tmp_path / "printed.txt").read_text()
-    names = {RunFolder.of(config).name for config in seeds(*words)}
-    folders = [RunFolder(path) for path in (tmp_path / "o" / "runs").iterdir()]
-    assert {folder.name for folder in folders} == names | {f"{name}~1" for name in names}
-    for folder in folders:
-        assert folder.state == "done"
-        assert (folder.path / "output.txt").read_text().count("starting run") == 1
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("how", ["interrupted", "terminated", "killed"])
 def test_the_end_of_a_sweep_commits_its_jobs(sweep: Sweep, seeds: Callable[..., list[Config]], how: str) -> None:
     configs = seeds(*LONG)

@@ -244,18 +244,6 @@ def test_the_pages_of_a_run_and_of_a_sweep_begin_with_their_results(
     page.get_by_text("IQM", exact=True).first.wait_for()
 
 
-@pytest.mark.slow
-def test_a_store_that_is_none_is_one_line(tmp_path: Path, free_port: Callable[[], int]) -> None:
-    (tmp_path / "mlflow.db").write_bytes(b"no database" * 1_000)
-    command = (*COMMAND, f"port={free_port()}", f"paths.outputs={tmp_path}")
-    ended = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
-    assert ended.returncode == 1
-    assert ended.stderr == (
-        f"atlantis_exp: {tmp_path}/mlflow.db cannot be used (DatabaseError: file is not a database): move it away, and "
-        f"python -m atlantis_exp sync paths.outputs={tmp_path} makes it again\n"
-    )
-
-
 def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
     with socket.socket() as held:
         held.bind(("127.0.0.1", 0))

@@ -5,8 +5,6 @@ import dataclasses
 import re
 import signal
 import sqlite3
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -20,15 +18,14 @@ from atlantis_exp.commands.jobs import words_of
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import NOTE, Artifact, Journal, Tags, read_commit
-from atlantis_exp.sessions.job import Job, fitted, replaced
+from atlantis_exp.runs.journal import NOTE, Artifact, Journal, Tags
+from atlantis_exp.sessions.job import Job, fitted
 from atlantis_exp.sessions.launchers import BASIC, Launcher
-from atlantis_exp.sessions.sweep import _every, hours_of, ledger, say_hours
-from atlantis_exp.sessions.training import train
+from atlantis_exp.sessions.sweep import _every, ledger, say_hours
+from atlantis_exp.sessions.training import measure, train
 from atlantis_exp.tracking.publishing import catch_up
 
 Compose = Callable[..., Config]
-REPOSITORY = Path(__file__).parents[2]
 ELSEWHERE = Launcher("elsewhere")  # none that needs a library
 SHORT = ("tracking=mlflow", "tracking.every_steps=20", "phase.quick.steps=80", "evaluation.every_steps=null")
 
@@ -160,7 +157,7 @@ def test_a_sweep_says_how_many_trainings_go_on_at_a_time_and_for_how_long(
     tiny: Compose, recorded: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     jobs = [Job(tiny(f"seed={seed}", "budget.forecast=warn")) for seed in (0, 1)]
-    assert 0 < hours_of(jobs[0], 1) < 1
+    assert 0 < measure(jobs[0], 1)[1].hours < 1
     say_hours(jobs, Launcher("joblib", {"n_jobs": 8, "cores": 1}))
     told = capsys.readouterr().out.splitlines()[-1]
     assert re.fullmatch(r"8 trainings at a time, 1 core each: about .+ if all take as long as cnn uniform s0", told)
@@ -221,35 +218,6 @@ def test_why_a_run_failed_takes_no_hold_of_the_terminal(
 
 
 @pytest.mark.slow
-def test_runs_trained_by_processes_of_their_own_have_one_parent_and_a_repeated_sweep_the_same(
-    pair: list[Job], tiny_overrides: tuple[str, ...]
-) -> None:
-    outputs = pair[0].outputs
-    with ledger(pair, ["seed=0,1"]):
-        command = (sys.executable, "-m", "atlantis_exp", *replaced(tiny_overrides, *SHORT, f"paths.outputs={outputs}"))
-        processes = [
-            subprocess.Popen((*command, f"seed={job.config.seed}"), cwd=REPOSITORY, stdout=subprocess.DEVNULL)
-            for job in pair
-        ]
-        assert [process.wait() for process in processes] == [0, 0]
-    sweeps = rows(outputs, "SELECT run_uuid, status FROM runs WHERE name = 'sweep seed=0,1'")
-    assert sweeps == [(sweeps[0][0], "FINISHED")]
-    children = tags(outputs, "mlflow.parentRunId")
-    assert len(children) == 2
-    assert set(children.values()) == {sweeps[0][0]}
-    note = tags(outputs, "mlflow.note.content")["sweep seed=0,1"]
-    assert all(f"| {name} | done | 80 |" in note for name in children)
-    page = next((outputs / "sweeps").glob("sweep-*")) / "artifacts"
-    table = list(csv.DictReader((page / "runs.csv").open()))
-    assert {line["run"] for line in table} == {job.config.run_name() for job in pair}
-
-    with ledger(pair, ["seed=0,1"]):
-        for job in pair:
-            train(job)
-    assert rows(outputs, "SELECT run_uuid, status FROM runs WHERE name = 'sweep seed=0,1'") == sweeps
-
-
-@pytest.mark.slow
 def test_a_job_that_fails_is_shown_as_failed_with_its_error_and_so_is_its_sweep(pair: list[Job]) -> None:
     outputs = pair[0].outputs
     broken = dataclasses.replace(pair[1], config=dataclasses.replace(pair[1].config, device="cuda:9"))
@@ -283,22 +251,6 @@ def test_a_sweep_that_a_signal_ends_is_closed(tiny: Compose, tmp_path: Path, num
         sweep()
     signal.signal(signal.SIGINT, before)
     assert page_of(tmp_path).status == "KILLED"
-
-
-@pytest.mark.slow
-def test_a_larger_sweep_takes_the_runs_of_a_smaller_one_over(
-    pair: list[Job], tiny: Compose, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with ledger(pair, ["seed=0,1"]):
-        pass
-    shown = [line for line in capsys.readouterr().out.splitlines() if not line.startswith("publishing")]
-    assert len(shown) == 6  # two tables: what trains here shows itself
-    small = {read_commit(path).parent for path in (pair[0].outputs / "runs").iterdir()}  # type: ignore[union-attr]
-    with ledger([*pair, Job(tiny(*SHORT, "seed=2"))], ["seed=0,1,2"]):
-        pass
-    large = {read_commit(path).parent for path in (pair[0].outputs / "runs").iterdir()}  # type: ignore[union-attr]
-    assert len(small) == len(large) == 1
-    assert small != large
 
 
 def test_a_launchers_sweep_marks_what_was_killed_before_it(tiny: Compose, tmp_path: Path) -> None:

@@ -3,10 +3,7 @@
 import io
 import json
 import re
-import signal
 import sqlite3
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, suppress
@@ -31,7 +28,6 @@ from atlantis_exp.tracking.mirror import publish
 from atlantis_exp.tracking.publishing import catch_up, unfinished
 from atlantis_exp.tracking.store import Store, all_pages
 
-REPOSITORY = Path(__file__).parents[2]
 WAITING = re.compile(r", \d+ s$")
 """Lines that say what is waited for, on a slow machine."""
 
@@ -266,30 +262,6 @@ def test_a_store_that_fails_in_the_middle_ends_it_and_a_folder_that_fails_does_n
     store.is_gone = True
     with pytest.raises(Fault, match="no answer"):
         [*publish_all(tmp_path, store)]
-
-
-@pytest.mark.slow
-def test_it_goes_on_looking_until_it_is_interrupted(outputs: Path) -> None:
-    command = (sys.executable, "-m", "atlantis_exp", "sync", "every=1s", f"paths.outputs={outputs}")
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background job lacks
-    looking = subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    signal.signal(signal.SIGINT, before)
-    try:
-        assert looking.stdout is not None
-        while WAITING.search(line := looking.stdout.readline()):
-            pass
-        assert line.endswith("mlflow.db: 0 runs\n")
-        a_sweep_of_one(outputs, "late")
-        seen: set[str] = set()
-        while not {"  published   runs/late\n", "  published   sweeps/sweep-late\n"} <= seen:
-            seen.add(line := looking.stdout.readline())
-            assert line
-        looking.send_signal(signal.SIGINT)
-        _, error = looking.communicate(timeout=60)
-        assert (looking.returncode, error) == (130, "")
-    finally:
-        looking.kill()
-        looking.wait()
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.machine import Machine
 from atlantis_exp.runs.facts import read_facts
 from atlantis_exp.runs.folder import RunFolder, find_run
-from atlantis_exp.runs.journal import Artifact, Image, Journal, Metrics, Model, adopt, read
+from atlantis_exp.runs.journal import Journal, Metrics, adopt, read
 from atlantis_exp.sessions.contracts import fingerprints
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.launchers import BASIC
@@ -33,7 +33,6 @@ from atlantis_exp.sessions.reporting import report
 from atlantis_exp.sessions.sweep import sweep
 from atlantis_exp.sessions.training import _kin, train
 from atlantis_exp.tracking.mirror import publish
-from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.tracking.store import Store
 from atlantis_exp.training.checkpoint import CheckpointError, Checkpoints
 from atlantis_exp.training.forecast import Forecast
@@ -42,7 +41,6 @@ from atlantis_exp.training.trainer import Trainer
 from benchmarks.kills import train_and_kill
 
 Compose = Callable[..., Config]
-Served = Callable[[Path, int], AbstractContextManager[None]]
 REPOSITORY = Path(__file__).parents[2]
 COMMAND = (sys.executable, "-m", "atlantis_exp")
 SHORT = ("phase.quick.steps=40", "evaluation.at_end=false", "evaluation.every_steps=null")
@@ -221,19 +219,6 @@ def test_a_budget_of_arithmetic_ends_a_run_at_the_step_that_spends_it_and_a_larg
     result = RunFolder.of(config).result
     assert result is not None
     assert result.outcome == "finished"
-
-
-@pytest.mark.slow
-def test_a_larger_budget_continues_a_run_that_its_budget_ended(tiny: Compose) -> None:
-    for steps in ("80", "120", "null"):
-        config = tiny(f"budget.steps={steps}", "evaluation.at_end=false", "evaluation.every_steps=null")
-        train(Job(config))
-    result = RunFolder.of(config).result
-    assert result is not None
-    assert (result.outcome, result.steps) == ("finished", 160)
-    unbroken = at(config, Path(config.paths.outputs, "u"))
-    train(Job(unbroken))
-    assert fingerprints(config, Path(config.paths.outputs)) == fingerprints(unbroken, Path(unbroken.paths.outputs))
 
 
 @pytest.mark.parametrize(
@@ -443,85 +428,6 @@ def test_counters_that_no_training_comes_to_are_one_line(
         train(Job(tiny(*SHORT, "budget.forecast=warn")))
 
 
-@pytest.fixture
-def failing_disk(tmp_path: Path) -> Iterator[Path]:
-    """An ext4 file system on a file, where mounting one is allowed."""
-    image, disk = tmp_path / "disk.img", tmp_path / "disk"
-    disk.mkdir()
-    image.touch()
-    os.truncate(image, 2**26)
-    for command in (("mkfs.ext4", "-q", str(image)), ("mount", "-o", "loop", str(image), str(disk))):
-        if shutil.which(command[0]) is None or subprocess.run(command, capture_output=True, check=False).returncode:
-            pytest.skip(f"may not {' '.join(command[:3])}")
-    yield disk
-    subprocess.run(("umount", str(disk)), check=True)
-
-
-@pytest.mark.slow
-def test_a_disk_that_becomes_read_only_is_one_clear_line_and_costs_nothing_committed(
-    tiny: Compose, tiny_overrides: tuple[str, ...], failing_disk: Path
-) -> None:
-    chosen = ("phase.quick.steps=2_000", "evaluation.every_steps=null", "tracking.commit_seconds=0.2")
-    config = at(tiny(*chosen), failing_disk)
-    folder = RunFolder.of(config)
-    running = session(config, tiny_overrides, *chosen)
-    wait_for(lambda: generation(folder) > 1)
-    subprocess.run(("mount", "-o", "remount,abort", str(failing_disk)), check=True)  # as after an error of the disk
-    _, error = running.communicate()
-    assert running.returncode == 1
-    (line,) = error.strip().splitlines()
-    assert re.search(r"^atlantis_exp: run .*Read-only file system.*; continue with: ", line)
-    device = str(failing_disk.parent / "disk.img")
-    subprocess.run(("umount", str(failing_disk)), check=True)
-    subprocess.run(("e2fsck", "-fy", device), check=False, capture_output=True)
-    subprocess.run(("mount", "-o", "loop", device, str(failing_disk)), check=True)
-    assert generation(folder) > 0
-    train(Job(config))
-    unbroken = tiny(*chosen)
-    train(Job(unbroken))
-    assert fingerprints(config, failing_disk) == fingerprints(unbroken, Path(unbroken.paths.outputs))
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("faketime") is None, reason="faketime is not installed")
-def test_a_clock_that_jumps_by_a_day_changes_no_duration_and_ends_nothing(
-    tiny: Compose, tiny_overrides: tuple[str, ...], tmp_path: Path
-) -> None:
-    library = subprocess.run(
-        ("faketime", "-f", "+0", "printenv", "LD_PRELOAD"), capture_output=True, text=True, check=True
-    ).stdout.strip()
-    shift = tmp_path / "shift"
-    shift.write_text("+0")
-    faked = {"FAKETIME_TIMESTAMP_FILE": str(shift), "FAKETIME_NO_CACHE": "1", "FAKETIME_DONT_FAKE_MONOTONIC": "1"}
-    chosen = (*LONG, "budget.wall_clock=1h")
-    config = tiny(*chosen)
-    folder = RunFolder.of(config)
-    running = session(config, tiny_overrides, *chosen, LD_PRELOAD=library, **faked)
-    for jump in ("+0", "+1d", "-1d"):
-        aside = tmp_path / "aside"
-        aside.write_text(jump)
-        aside.replace(shift)
-        before = generation(folder)
-        wait_for(lambda before=before: running.poll() is not None or generation(folder) > before + 2)  # type: ignore[misc]
-    running.send_signal(signal.SIGUSR2)
-    _, error = running.communicate()
-    assert running.returncode == 128 + signal.SIGUSR2
-    (line,) = error.strip().splitlines()
-    assert line.startswith(f"atlantis_exp: SIGUSR2: run {folder.name} is committed at step")
-    records = [record for _, record in read(folder.path) if isinstance(record, Metrics)]
-    times = [record.time for record in records]
-    assert times == sorted(times)
-    assert times[-1] - times[0] > 80_000_000  # ms: the jump was seen
-    curves = [record.values for record in records if "throughput/hours" in record.values]
-    hours = [values["throughput/hours"] for values in curves]
-    assert hours == sorted(hours)
-    assert 0 <= hours[0] <= hours[-1] < 1
-    assert all(values["throughput/steps_per_second"] >= 0 for values in curves)
-    commit = folder.commit
-    assert commit is not None
-    assert commit.started <= times[0] <= times[-1] <= commit.updated
-
-
 def test_a_commit_that_the_disk_refuses_is_one_clear_line_and_costs_nothing_committed(
     tiny: Compose, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -619,79 +525,6 @@ def test_a_killed_run_is_shown_as_interrupted_then_continued_and_sigterm_ends_it
     assert error.startswith(f"atlantis_exp: SIGTERM: run {folder.name} is committed at step")
     assert "continue with: python -m atlantis_exp experiment=quick" in error
     assert folder.status == "KILLED"
-
-
-@pytest.mark.slow
-def test_the_next_command_tells_mlflow_of_a_run_that_was_killed(tiny: Compose) -> None:
-    config = tiny(*SHORT, "budget.steps=20", "tracking=mlflow")
-    outputs = Path(config.paths.outputs)
-    train(Job(config))
-    journal = Journal(RunFolder.of(config).path)
-    journal.status("RUNNING")
-    publish(RunFolder.of(config).path, Store(outputs))
-
-    def shown() -> list[tuple[str, str]]:
-        query = "SELECT status, value FROM runs JOIN tags USING (run_uuid) WHERE key = 'resumable'"
-        with closing(sqlite3.connect(outputs / "mlflow.db")) as database:
-            return database.execute(query).fetchall()
-
-    assert shown() == [("RUNNING", "false")]
-    catch_up(outputs)
-    assert shown() == [("KILLED", "true")]
-
-
-@pytest.mark.slow
-def test_a_server_that_is_gone_for_a_while_has_everything_once_it_is_back(
-    tiny: Compose, tiny_overrides: tuple[str, ...], tmp_path: Path, free_port: Callable[[], int], mlflow_server: Served
-) -> None:
-    port = free_port()
-    server = tmp_path / "server"
-    server.mkdir()
-    chosen = (
-        *("tracking=mlflow", f"tracking.uri=http://127.0.0.1:{port}", "tracking.every_steps=200"),
-        *replaced(LONG, "evaluation.every_steps=1_000", "tracking.histogram_episodes=50"),
-    )
-    config = tiny(*chosen)
-    folder = RunFolder.of(config).path
-
-    def published() -> int:
-        file = folder / "published.json"
-        return int(json.loads(file.read_bytes())["offset"]) if file.exists() else 0
-
-    def evaluations() -> int:
-        return len(list(folder.glob("artifacts/evaluation/*.csv")))
-
-    with mlflow_server(server, port):
-        training = session(config, tiny_overrides, *chosen)
-        wait_for(lambda: published() > 0)
-    time.sleep(2.0)  # seconds; what the server answered at the end is noted in published.json by then
-    before, evaluated = published(), evaluations()
-    time.sleep(6.0)  # seconds; the publisher looks every 5
-    wait_for(lambda: evaluations() >= evaluated + 3)
-    assert published() == before
-    with mlflow_server(server, port):
-        training.send_signal(signal.SIGTERM)
-        out, error = training.communicate()
-        assert training.returncode == 143
-        assert (out + error).count("Publishing to MLflow fails") == 1
-        publish(folder, Store(tmp_path, tracking_uri=config.tracking.uri))  # what the command did not wait for
-
-    records = [record for _, record in read(folder)]
-    assert points(server, folder.name) == journaled(folder)
-    runs = list((server / "artifacts").glob("*/*/artifacts/config.json"))
-    assert len(runs) == 1
-    images = [record for record in records if isinstance(record, Image)]
-    shown = [path.name for path in (runs[0].parent / "images").iterdir()]
-    assert len(images) >= 3
-    for record in images:
-        name = f"{record.key.replace('/', '~')}+step+{record.step}+timestamp+{record.time}+"
-        assert len([file for file in shown if file.startswith(name)]) == 2  # one and its thumbnail
-    assert len(shown) == 2 * len(images)
-    for artifact in {record.path for record in records if isinstance(record, Artifact)}:
-        assert (runs[0].parent / artifact).read_bytes() == (folder / "artifacts" / artifact).read_bytes()
-    models = [folder / "artifacts" / record.path for record in records if isinstance(record, Model)]
-    stored = [path.read_bytes() for path in (server / "artifacts").glob("*/models/*/artifacts/*")]
-    assert sorted(stored) == sorted(path.read_bytes() for path in models)
 
 
 def test_a_sweep_runs_what_is_missing_and_tables_what_it_found(

@@ -16,7 +16,6 @@ from atlantis_exp.sessions.weights import stored_weights
 from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.recorder import Recorder
 
-Command = Callable[..., int]
 Compose = Callable[..., Config]
 
 
@@ -60,29 +59,6 @@ def test_a_damaged_journal_of_a_folder_without_checkpoints_is_one_line(recorded:
     journal.write_bytes(journal.read_bytes().replace(b"{", b"[", 1))
     with pytest.raises(Fault, match=f"^run {run.name}: .*byte 0"):
         stored_weights(run, "best")
-
-
-@pytest.mark.slow
-def test_best_of_the_commit_before_is_found_where_the_last_is_damaged(interrupted: RunFolder) -> None:
-    newest = max(interrupted.checkpoints.glob("[0-9]*"))
-    (newest / "state.json").write_bytes(b"{}")
-    weights, step = stored_weights(interrupted, "best")
-    assert (step, weights) == (80, interrupted.artifact("models/network/80.safetensors").read_bytes())
-
-
-@pytest.mark.parametrize("verb", ["export to={folder}/new", "evaluate weights=best tracking=none"])
-@pytest.mark.slow
-def test_a_flipped_byte_is_one_line(
-    verb: str, interrupted: RunFolder, command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = interrupted.artifact("models/network/80.safetensors")
-    content = bytearray(file.read_bytes())
-    content[-7] ^= 1
-    file.write_bytes(content)
-    outputs = interrupted.path.parents[1]
-    assert command(*verb.format(folder=tmp_path).split(), f"paths.outputs={outputs}") == 1
-    assert f"{file} is damaged, or newer than the run's last commit\n" in capsys.readouterr().err
-    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.slow

@@ -1,9 +1,6 @@
 import io
 import json
 import re
-import signal
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -13,7 +10,7 @@ import pytest
 
 from atlantis_exp.config import Config
 from atlantis_exp.runs.folder import TRACEBACK
-from atlantis_exp.runs.journal import Commit, Journal, Metrics, adopt, commit_bytes, read, read_commit
+from atlantis_exp.runs.journal import Commit, Journal, adopt, commit_bytes, read, read_commit
 from atlantis_exp.tracking.local import Point
 from atlantis_exp.tracking.mirror import publish
 from atlantis_exp.tracking.publishing import unfinished
@@ -31,8 +28,6 @@ from tests.tracking.folders import (
     run_id,
     same_but_for_ids,
 )
-
-REPOSITORY = Path(__file__).parents[2]
 
 
 def test_mlflow_shows_what_is_committed_and_no_more(tmp_path: Path, root: Path, store: Store) -> None:
@@ -107,39 +102,6 @@ def test_publishing_everything_again_changes_nothing(tmp_path: Path, root: Path,
     assert (tmp_path / "published.json").read_bytes() == cursor
     identity = json.loads(cursor)["identity"]
     assert len(rows(root, "SELECT * FROM tags WHERE value = ?", identity)) == 1
-
-
-@pytest.mark.slow
-def test_a_process_killed_between_sending_and_noting_it_doubles_nothing(
-    tmp_path: Path, root: Path, store: Store
-) -> None:
-    a_full_journal(tmp_path)
-    publish(tmp_path, store_of_its_own := Store(root, "unbroken"))
-    unbroken = everything(root, tmp_path)
-    assert store_of_its_own.address != store.address
-    killed = f"""
-import os, signal
-from pathlib import Path
-from atlantis_exp.tracking.mirror import Cursor, publish
-from atlantis_exp.tracking.store import Store
-save, calls = Cursor.save, []
-def save_or_die(cursor, folder):
-    calls.append(cursor)
-    if len(calls) == 3:
-        os.kill(os.getpid(), signal.SIGKILL)
-    save(cursor, folder)
-Cursor.save = save_or_die
-publish(Path({str(tmp_path)!r}), Store(Path({str(root)!r})))
-"""
-    process = subprocess.run([sys.executable, "-c", killed], cwd=REPOSITORY, check=False)
-    assert process.returncode == -signal.SIGKILL
-    sent = points(root, tmp_path)
-    noted = json.loads((tmp_path / "published.json").read_bytes())["offset"]
-    assert len(sent) > sum(
-        len(record.values) for end, record in read(tmp_path, 0, noted) if isinstance(record, Metrics)
-    )
-    publish(tmp_path, store)
-    assert same_but_for_ids(everything(root, tmp_path)) == same_but_for_ids(unbroken)
 
 
 class FailsOnce(Store):
@@ -218,23 +180,6 @@ def test_points_of_one_millisecond_survive_a_break_between_their_batches(
     assert 0 < len(points(root, tmp_path)) < 12_000
     publish(tmp_path, store)
     assert points(root, tmp_path) == journaled_points(tmp_path)
-
-
-def test_a_resumed_run_shows_the_steps_it_redid_once(tmp_path: Path, root: Path, store: Store) -> None:
-    journal = Journal(tmp_path)
-    for step in range(5):
-        journal.metrics({"score": step}, step)
-    state = commit(journal)
-    journal.metrics({"score": 99}, 5)
-    journal.state_dict()  # killed before its checkpoint
-    publish(tmp_path, store)
-    resumed = Journal(tmp_path)
-    resumed.load_state_dict(state)
-    for step in range(5, 8):
-        resumed.metrics({"score": step}, step)
-    commit(resumed)
-    publish(tmp_path, store)
-    assert [(step, value) for _, step, _, value in points(root, tmp_path)] == [(step, step) for step in range(8)]
 
 
 def test_a_run_that_goes_back_behind_what_was_published_replaces_it(tmp_path: Path, root: Path, store: Store) -> None:
@@ -389,6 +334,7 @@ def test_the_status_follows_the_run_through_its_sessions(tmp_path: Path, root: P
         [(shown, end)] = rows(root, "SELECT status, end_time FROM runs WHERE run_uuid = ?", run_id(tmp_path))
         updated = json.loads((tmp_path / "commit.json").read_bytes())["updated"]
         assert shown == status
+        assert dict(everything(root, tmp_path)["tags"])["resumable"] == str(status in ("KILLED", "FAILED")).lower()
         assert status == "RUNNING" or end == updated
     assert points(root, tmp_path) == journaled_points(tmp_path)
 

@@ -6,17 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
-from atlantis_exp.build import build_trainer
-from atlantis_exp.config import Config
 from atlantis_exp.replay.samplers import PrioritizedSampler
-from atlantis_exp.runs.journal import Journal
 from atlantis_exp.training import forecast as forecast_module
 from atlantis_exp.training.fingerprint import fingerprint, history
 from atlantis_exp.training.forecast import Forecast, forecast
 from atlantis_exp.training.plan import Counters, Phase
-from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Trainer
 
 GIB = 2**30
@@ -59,43 +54,6 @@ def test_a_training_with_a_forecast_is_bit_for_bit_the_one_without(
     assert len(timed) == 3
     assert prints[0] == prints[1]
     assert histories[0] == histories[1] != []
-
-
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        ("model=cnn",),
-        ("model=resnet", "env.size=16", "training.ema=10"),
-        ("env.num_envs=3", "env.workers=2", "sampler=prioritized"),
-        ("model=resnet_fast", "objective=quantile", "env.noop_max=5"),
-    ],
-)
-@pytest.mark.slow
-def test_a_real_training_is_none_the_wiser_of_forecasts_at_its_start_and_when_it_goes_on(
-    tiny: Callable[..., Config],
-    started: Callable[[Config, Path], Trainer],
-    tmp_path: Path,
-    overrides: tuple[str, ...],
-) -> None:
-    config = tiny("evaluation.every_steps=null", *overrides)
-    without = started(config, tmp_path / "without")
-    without.run()
-    size = config.env.size
-    first = started(config, tmp_path / "with")
-    first.learner.update_flops((4, size, size), 4)
-    expected_of(first, size)
-    first.run(lambda: first.counters.steps >= 60)
-
-    second = build_trainer(config, 1, tmp_path / "with", Journal(tmp_path / "with"), Progress(Console(quiet=True)))
-    with second.emulators:
-        state = second.checkpoints.load(second.memory)
-        assert state is not None
-        expected_of(second, size, done=Counters(steps=60))  # by parts that have yet to be brought to where they were
-        second.load_state_dict(state)
-        second.run()
-        assert fingerprint(second.state_dict(), second.memory, tmp_path / "with") == fingerprint(
-            without.state_dict(), without.memory, tmp_path / "without"
-        )
 
 
 @pytest.mark.parametrize("schedule", ["epsilon", "learning_rate"])

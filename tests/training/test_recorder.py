@@ -129,6 +129,23 @@ def test_the_description_says_where_a_training_was_too_short_for_curves(
     assert said == [False] * (len(notes) - 1) + [short]
 
 
+def test_a_line_says_how_the_training_stands(small: Small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = io.StringIO()
+    trainer = small(tmp_path, console=Console(file=told, width=300), evaluate_steps=None)
+    monkeypatch.setattr(trainer.recorder.progress, "is_due", lambda: True)
+    trainer.run(lambda: trainer.counters.steps == 100)
+    lines = [line for line in told.getvalue().splitlines() if line.startswith("episode ")]
+    assert "  first episode  epsilon " in lines[0]
+    scores = [played.score for played in trainer.recorder.episodes]
+    assert len(scores) == 2
+    epsilon = trainer.plan.epsilon_at(trainer.counters)
+    stands = f"score {scores[-1]:,.0f}  mean of 20 {np.mean(scores):,.0f}  duration 40 (mean of 100 40)"
+    assert lines[-1].startswith(
+        f"episode 3  {stands}  epsilon {epsilon:.2f}  step 100  updates {trainer.learner.updates}  "
+    )
+    assert "  phase quick  62.5%  left " in lines[-1]
+
+
 def test_every_number_of_an_evaluation_is_said_at_one_step_and_the_last_ones_is_where_the_run_ended(
     small: Small, tmp_path: Path
 ) -> None:

@@ -14,7 +14,7 @@ import torch
 
 from atlantis_exp.build import make_emulator
 from atlantis_exp.config import Config
-from atlantis_exp.game.vector import Steps, WorkerDied
+from atlantis_exp.game.vector import Steps
 from atlantis_exp.learning.schedules import Linear
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.replay.samplers import Draw, PrioritizedSampler, Sampler, TopHalfSampler, UniformSampler
@@ -126,27 +126,21 @@ def test_the_same_seed_gives_the_same_training_and_another_seed_another(small: S
     "overrides",
     [
         ("model=cnn", "env.num_envs=1"),
-        pytest.param(("model=cnn", "env.num_envs=3", "env.workers=2", "objective=double_dqn"), marks=pytest.mark.slow),
-        pytest.param(
-            ("model=resnet", "env.size=16", "env.num_envs=1", "optimizer=rmsprop", "objective.target.mode=train"),
-            marks=pytest.mark.slow,
-        ),
         pytest.param(
             (
-                *("env.num_envs=3", "env.workers=2", "sampler=prioritized"),
+                *("model=resnet", "env.size=16", "env.num_envs=3", "env.workers=2", "optimizer=rmsprop"),
+                *("objective.target.mode=train", "objective=double_dqn", "sampler=prioritized"),
                 *("phase.quick.sampler=prioritized", "phase.second.sampler=prioritized"),
             ),
             marks=pytest.mark.slow,
         ),
         pytest.param(
             (
-                *("objective=quantile", "lr_schedule=one_cycle", "objective.n_step=3"),
-                *("objective.target.tau=1", "objective.target.every=3"),
+                *("env=atlantis_standard", "env.size=40", "env.num_envs=8", "objective=quantile"),
+                *("lr_schedule=one_cycle", "objective.n_step=3", "objective.target.tau=1", "objective.target.every=3"),
             ),
             marks=pytest.mark.slow,
         ),
-        pytest.param(("model=resnet", "env.size=16", "env.num_envs=8", "env.workers=2"), marks=pytest.mark.slow),
-        pytest.param(("model=cnn", "env.num_envs=8", "env=atlantis_standard", "env.size=40"), marks=pytest.mark.slow),
         pytest.param(
             ("model=cnn", "env.num_envs=3", "env.workers=2", "compile=true"),
             marks=[pytest.mark.slow, pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs it")],
@@ -459,21 +453,6 @@ def test_an_evaluation_that_is_asked_to_stop_is_made_good(small: Small, tmp_path
     assert step not in dict(curve(tmp_path / "broken", "evaluation/mean"))
     continued = small(tmp_path / "broken", phases=phases(120))
     assert continued.run() == "finished"
-    assert print_of(continued, tmp_path / "broken") == print_of(unbroken, tmp_path / "unbroken")
-
-
-@pytest.mark.slow
-def test_a_run_goes_on_after_its_worker_was_killed(tiny: Compose, started: Start, tmp_path: Path) -> None:
-    config = tiny("env.num_envs=3", "env.workers=2")
-    unbroken = started(config, tmp_path / "unbroken")
-    unbroken.run()
-    trainer = started(config, tmp_path / "broken")
-    trainer.run(after(20))
-    trainer.emulators._processes[1].kill()  # type: ignore[attr-defined]
-    with pytest.raises(WorkerDied, match="SIGKILL"):
-        trainer.run()
-    continued = started(config, tmp_path / "broken")
-    continued.run()
     assert print_of(continued, tmp_path / "broken") == print_of(unbroken, tmp_path / "unbroken")
 
 

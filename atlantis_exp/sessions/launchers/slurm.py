@@ -47,8 +47,7 @@ class _Training:
 def submit(jobs: Sequence[Job], launcher: Launcher, train: Train) -> None:
     """Submit jobs as one array and wait for all of them; an interrupt ends the waiting and says that they go on.
 
-    Raises:
-        Fault: of the first job that failed, or was cancelled or killed; or why Slurm took none.
+    Raises: Fault of the first job that failed, or was cancelled or killed; or why Slurm took none.
     """
     from submitit import AutoExecutor
     from submitit.core.utils import UncompletedJobError
