@@ -18,7 +18,7 @@ from tables import RANDOM, Row, updated
 from atlantis_exp.media import GREY
 from atlantis_exp.runs.folder import RunFolder, all_runs, evaluation_at
 from atlantis_exp.runs.journal import Tags, curve, read
-from atlantis_exp.statistics import interquartile_mean, interval, resample
+from atlantis_exp.statistics import interquartile_mean
 
 DATA = Path("docs/data/ladder.csv")
 COLUMNS = ("run", "command", "commit", "updates", "hours", "steps", "training", "evaluation")
@@ -76,9 +76,10 @@ def numbers(text: str) -> npt.NDArray[np.float64]:
 
 
 def estimates(row: Row) -> tuple[npt.NDArray[np.float64], tuple[float, float]]:
-    """The evaluated scores, and the 95 % interval of their mean over episodes."""
-    scores = numbers(row["evaluation"])
-    low, high = interval([sample.mean() for sample in resample([scores], 2_000, np.random.default_rng(0))])
+    """The evaluated scores, and the bootstrap's 95 % interval of their mean over episodes."""
+    scores, rng = numbers(row["evaluation"]), np.random.default_rng(0)
+    drawn = (rng.integers(np.full(scores.size, scores.size)) for _ in range(2_000))
+    low, high = np.percentile([scores[chosen].mean() for chosen in drawn], (2.5, 97.5))
     return scores, (float(low), float(high))
 
 
