@@ -135,11 +135,12 @@ def _explain(faults: list[ErrorDetails], tree: Mapping[str, Any]) -> str:
     if kind == "literal_error":
         choices = str(fault["ctx"]["expected"]).replace("'", "").replace(" or ", ", ").split(", ")
         return f"{key}={node}: no such choice; {nearest(str(node), choices)}"
-    if isinstance(node, float) and node.is_integer() and any(other["type"] == "int_type" for other in faults):
-        return f"{key}={node:g}: should be an integer; write {key}={int(node):_}"
     # A key that may hold one type or another has a fault for each.
-    messages = [other["msg"] for other in faults if _locate(other, tree)[0] == path]
-    alternatives = dict.fromkeys(re.sub(r"^\w+ should ", "", message) for message in messages)
+    here = [other for other in faults if _locate(other, tree)[0] == path]
+    is_whole = isinstance(node, float) and node.is_integer() and abs(node) < 2**63
+    if is_whole and any(other["type"] == "int_type" for other in here):
+        return f"{key}={node:g}: should be an integer; write {key}={int(node):_}"
+    alternatives = dict.fromkeys(re.sub(r"^\w+ should ", "", other["msg"]) for other in here)
     bounds = re.sub(r"\b0\.0{4,}\d+", lambda tiny: f"{float(tiny[0]):g}", " or ".join(alternatives))
     shown = json.dumps(node)
     shown = shown if len(shown) <= 60 else f"{shown[:54]}..."

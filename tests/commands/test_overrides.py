@@ -94,6 +94,8 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("optimizer.betas=[0.9,1.0]", "optimizer.betas.1=1.0", "less than 1"),
     ("seed=-1", "seed=-1", "greater than or equal to 0"),
     ("budget.steps=1e6", "budget.steps=1e+06", "write budget.steps=1_000_000"),
+    ("budget.steps=1e300", "budget.steps=1e+300", "valid integer"),
+    ("objective.gamma=3.0 phase.single.steps=1.5", "objective.gamma=3.0", "less than 1"),
     ("threads=0", "threads=0", "greater than or equal to 1"),
     ("epsilon.start=1.5", "epsilon.start=1.5", "less than or equal to 1"),
     ("objective.target.tau=2", "objective.target.tau=2", "less than or equal to 1"),
