@@ -150,7 +150,7 @@ def shown(config_name: str, arguments: Sequence[str]) -> str:
     """Return the composed config of a checked command line as YAML."""
     flags = flags_of(arguments)
     with composing():
-        composed = _composed(config_name, flags.overrides, flags.config_dir)
+        composed = _composed(config_name, [read_override(text) for text in flags.overrides], flags.config_dir)
         return OmegaConf.to_yaml(composed, resolve=flags.resolve)
 
 
@@ -289,8 +289,8 @@ def is_longer(values: RangeSweep, most: int) -> bool:
 
 
 def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | None) -> T:
-    overrides = {text: read_override(text) for text in texts}
-    groups = _groups(config_name)
+    parsed, groups = [read_override(text) for text in texts], _groups(config_name)
+    overrides = dict(zip(texts, parsed, strict=True))
     chosen = tuple(text for text, override in overrides.items() if _key(override) in groups)
     for text in chosen:
         folder, value = overrides[text].key_or_group, overrides[text].value()
@@ -305,7 +305,7 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
     values = {text: override for text, override in overrides.items() if text not in chosen}
     try:
         try:
-            composed = _composed(config_name, texts, own)
+            composed = _composed(config_name, parsed, own)
         except (HydraException, ValueError):  # most often an unknown key, which `_check_keys` explains better
             _check_keys(values, _keys(config_name, chosen, own), groups)
             raise
@@ -345,10 +345,9 @@ def _offered(folder: str, name: str) -> str:
     return f"{folder}={name}: add {' or '.join(offers)}" if offers else ""
 
 
-def _composed(config_name: str, texts: Sequence[str], own: Path | None) -> DictConfig:
+def _composed(config_name: str, overrides: Sequence[Override], own: Path | None) -> DictConfig:
     """Compose a config as Hydra does, whose slow part many jobs of a sweep share."""
     groups = _groups(config_name)
-    overrides = [read_override(text) for text in texts]
     choices = tuple(str(each.input_line) for each in overrides if _key(each) in groups)
     config = deepcopy(_chosen(config_name, choices, own))
     ConfigLoaderImpl._apply_overrides_to_config([each for each in overrides if _key(each) not in groups], config)

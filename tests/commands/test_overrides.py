@@ -15,7 +15,7 @@ from atlantis_exp.commands.composing import composing
 from atlantis_exp.commands.evaluate import EvaluateConfig
 from atlantis_exp.commands.export import ExportConfig
 from atlantis_exp.commands.new import NewConfig
-from atlantis_exp.commands.overrides import _composed, check, located, refuse_twice
+from atlantis_exp.commands.overrides import _composed, check, located, read_override, refuse_twice
 from atlantis_exp.commands.play import PlayConfig
 from atlantis_exp.commands.query import QueryConfig
 from atlantis_exp.commands.report import ReportConfig
@@ -321,6 +321,6 @@ def test_a_config_is_composed_as_hydra_composes_it(line: str) -> None:
     with composing():
         expected = compose("config", line.split())
         for _ in range(2):  # the second from what the first has kept
-            composed = _composed("config", line.split(), None)
+            composed = _composed("config", [read_override(text) for text in line.split()], None)
             assert OmegaConf.to_yaml(composed) == OmegaConf.to_yaml(expected)
             assert OmegaConf.is_struct(composed)
