@@ -67,7 +67,8 @@ def check(contracts: Iterator[Contract], measured: Mapping[str, Job]) -> None:
     broken = [f"{each.component}: {each.contract}" for each in tried if not each.kept]
     costs = list[documents.Cost]()
     if measured and not broken:
-        costs = [_cost(name, job) for name, job in measured.items()]
+        for number, (name, job) in enumerate(measured.items(), 1):
+            costs.append(_cost(name, job, f"measuring costs, {number} of {len(measured)}"))
         terminal.console(least=120).print(_table(costs))
     terminal.document(documents.Check(trials=tried, costs=costs).model_dump_json())
     if broken:
@@ -306,9 +307,9 @@ def fingerprints(config: Config, outputs: Path) -> dict[str, str]:
     return fingerprint(state, memory, folder.path)
 
 
-def _cost(name: str, job: Job) -> documents.Cost:
+def _cost(name: str, job: Job, said: str) -> documents.Cost:
     """Measure a training on this machine; an update includes the draw of its batch."""
-    trainer, speed = measure(job)
+    trainer, speed = measure(job, said=said)
     size, batch = job.config.env.size, job.config.training.batch_size
     return documents.Cost(
         component=name,

@@ -205,11 +205,13 @@ def _begin_with(job: Job, folder: RunFolder) -> str:
     return f"To begin a training with its weights:\n  {export}\n  {begin}"
 
 
-def measure(job: Job, cores: int | None = None) -> tuple[Trainer, Forecast]:
+def measure(
+    job: Job, cores: int | None = None, said: str = "measuring how fast it goes here"
+) -> tuple[Trainer, Forecast]:
     """Return a training that is not begun, and its cost here with so many cores; None: with this process's."""
     config = dataclasses.replace(job.config, threads=job.config.threads or cores)
     set_up_torch(config, config.device)
-    with terminal.working("measuring how fast it goes here"), tempfile.TemporaryDirectory() as aside:
+    with terminal.working(said), tempfile.TemporaryDirectory() as aside:
         progress = Progress(Console(quiet=True))
         trainer = build_trainer(config, cores or job.machine.cores, Path(aside), Tracker(), progress)
         with trainer.emulators:

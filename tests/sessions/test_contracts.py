@@ -203,8 +203,19 @@ def test_a_training_that_is_continued_otherwise_breaks_the_contract(
 
 @pytest.mark.slow
 def test_the_table_says_what_is_kept_and_what_it_costs(
-    command: Command, tiny_overrides: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: Command,
+    tiny_overrides: tuple[str, ...],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    said, working = list[str](), terminal.working
+
+    def noting(what: str, how_far: Callable[[], str] = str) -> AbstractContextManager[None]:
+        said.append(what)
+        return working(what, how_far)
+
+    monkeypatch.setattr(terminal, "working", noting)
     (tmp_path / "mine.py").write_text(PARTS)
     words = [*tiny_overrides, f"plugins={tmp_path / 'mine.py'}", *CHOSEN, f"paths.outputs={tmp_path / 'outputs'}"]
     assert command("check", *words) == 0
@@ -214,6 +225,9 @@ def test_the_table_says_what_is_kept_and_what_it_costs(
     names = ("model=mine", "model=cnn", "model=resnet", "sampler=uniform", "objective=dqn")
     assert [re.search(rf"│ {name} +│ +40 │ +[\d,]+ │", shown) is not None for name in names] == [True] * 5
     assert not (tmp_path / "outputs").exists()
+    costs = [each for each in said if "costs" in each]
+    assert costs == [f"measuring costs, {number} of {len(costs)}" for number in range(1, len(costs) + 1)]
+    assert len(costs) >= len(names)
     (tmp_path / "mine.py").write_text(PARTS.replace("return 0.5", "return 7"))
     assert command("check", *replaced(words, "model=cnn")) == 1
     assert "broken: epsilon=mine: in [0, 1]" in capsys.readouterr().err
