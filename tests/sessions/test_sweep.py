@@ -259,6 +259,24 @@ def test_a_launchers_sweep_marks_what_was_killed_before_it(tiny: Compose, tmp_pa
         assert RunFolder(tmp_path / "runs" / "killed").status == "KILLED"
 
 
+def test_a_launchers_sweep_shows_its_runs_while_other_processes_train_them(
+    tiny: Compose,
+    recorded: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")  # a terminal is drawn on once a second
+    shown = ""
+    with ledger([Job(tiny(f"seed={seed}")) for seed in (0, 1)], ["seed=0,1"], ELSEWHERE):
+        recorded("seed=0")
+        patience = time.monotonic() + 60
+        while not re.search(r"cnn uniform s0 +done +200 of", shown):
+            assert time.monotonic() < patience
+            time.sleep(0.1)
+            shown += capsys.readouterr().out
+    assert re.search(r"cnn uniform s1 +queued", shown)
+
+
 @pytest.mark.slow
 def test_a_launchers_sweep_publishes_the_runs_that_other_processes_train(
     pair: list[Job], recorded: Callable[..., Path]
