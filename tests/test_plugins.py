@@ -166,6 +166,7 @@ def _nothing_is_admitted_afterwards() -> Iterator[None]:
     admit([])
 
 
+@pytest.mark.slow
 def test_all_kinds_from_files_are_trained_and_continued_bit_for_bit(
     plugins: Path, command: Command, tiny_overrides: tuple[str, ...]
 ) -> None:

@@ -103,6 +103,7 @@ def test_a_training_on_another_device_began_like_the_kept_one() -> None:
     assert {float(row["mean"]) for row in printed[:3]} <= {*publish.metrics_of(run, "score/mean_20")}
 
 
+@pytest.mark.slow
 def test_what_is_kept_compares_as_it_did_and_names_no_place(
     recorded: Callable[..., Path], command: Callable[..., int], tmp_path: Path
 ) -> None:
