@@ -1,4 +1,4 @@
-"""Say what a reader must know before believing a comparison: a function a subject, which yields its lines or none."""
+"""Write the caveats and notes of a comparison: one function per subject, which yields its lines, if any."""
 
 import json
 from collections import defaultdict
@@ -32,7 +32,7 @@ _SHARES = {"frames": "{:,.0f} frames", "hours": "{:.2f} hours", "flops": "{:.3g}
 
 @dataclass(frozen=True)
 class Facts:
-    """All that a note may be about."""
+    """The input of all notes."""
 
     game: Component | None
     groups: Mapping[str, Sequence[Training]]
@@ -42,7 +42,7 @@ class Facts:
     answers: Sequence[Answer]
     tables: Mapping[str, Table]
     frames: float  # of the longest training
-    account: Sequence[str] = ()  # what other questions about the runs mean for this one
+    account: Sequence[str] = ()  # remarks on other questions about the runs
 
     @property
     def by(self) -> Sequence[str]:
@@ -59,7 +59,7 @@ Note = Callable[[Facts], Iterator[str]]
 
 
 def stands(facts: Facts) -> Iterator[str]:
-    """Say what each answer rests on: score, looks, seeds, error, length of training, and other questions."""
+    """Yield the basis of each answer: score, looks, seeds, error, length of training, and other questions."""
     if facts.question.score == "training":
         yield f"The score is {measure(facts.question)}."
     length = f"; trained for up to {facts.frames:,.0f} frames" if facts.frames else ""
@@ -69,7 +69,7 @@ def stands(facts: Facts) -> Iterator[str]:
 
 
 def further_answers(facts: Facts) -> Iterator[str]:
-    """Say which groups may be best, and of a few pairs how often a seed wins, and what remains possible."""
+    """Yield the groups that may be best; for a few pairs, how often a seed wins, and what remains possible."""
     for answer in facts.answers:
         plan, best = answer.family.plan, may_be_best(answer.decision)
         if plan.baseline is None and 1 < len(best) < len(answer.family.seeds):
@@ -97,7 +97,7 @@ def further_answers(facts: Facts) -> Iterator[str]:
 
 
 def conditions(facts: Facts) -> Iterator[str]:
-    """Say how much a look overstates each difference, and which collapse would undo its verdict."""
+    """Yield how much a look overstates each difference, and which collapse would undo its verdict."""
     for answer, look, verdict in _looked_at(facts):
         if verdict.said in ("better", "worse"):
             one, other = verdict.leading.group, verdict.leading.other
@@ -120,7 +120,7 @@ def _looked_at(facts: Facts) -> Iterator[tuple[Answer, Look, Verdict]]:
 
 
 def unusual_runs(facts: Facts) -> Iterator[str]:
-    """Name runs whose policy, replay memory or code makes their scores mean less, and those that play alike."""
+    """Name runs whose policy, replay memory or code makes scores less meaningful, and runs that play alike."""
     for label, runs in facts.groups.items():
         if names := [run.name for run in runs if run.has_collapsed]:
             yield (
@@ -136,7 +136,7 @@ def unusual_runs(facts: Facts) -> Iterator[str]:
 
 
 def missing_seeds(facts: Facts) -> Iterator[str]:
-    """Name seeds that a group lacks: unfinished or damaged, or left out, perhaps for their scores."""
+    """Name the seeds that a group lacks: unfinished, damaged, or left out, perhaps for their scores."""
     seeds = {label: {run.config["seed"] for run in runs} for label, runs in facts.groups.items()}
     names = defaultdict(list)
     for run in facts.lost:
@@ -156,7 +156,7 @@ def missing_seeds(facts: Facts) -> Iterator[str]:
 
 
 def modes_found(facts: Facts) -> Iterator[str]:
-    """Describe seeds that fall into two modes: their mean is the score of neither."""
+    """Describe seeds that fall into two modes, whose mean is the score of neither."""
     played = {row["group"]: row for row in facts.tables["evaluation"]}
     for group in facts.scored:
         if (found := modes(list(group.seeds.values()))) is not None:
@@ -172,7 +172,7 @@ def modes_found(facts: Facts) -> Iterator[str]:
 
 
 def unlike(facts: Facts) -> Iterator[str]:
-    """Name differences between runs that their identity leaves out; a tag that some lack may differ there."""
+    """Name differences between runs that their identity ignores; a missing tag counts as a difference."""
     subjects: dict[str, Callable[[Training], str]] = {
         "made in different precisions": lambda run: run.tags.get("precision", "not recorded"),
         "made on different devices": lambda run: run.tags.get("device", "not recorded"),
@@ -190,14 +190,14 @@ def unlike(facts: Facts) -> Iterator[str]:
 
 
 def _ended_by(run: Training) -> str:
-    """Return what ended a training, as a user writes it."""
+    """Return the limits that ended a training, as a user writes them."""
     steps, flops = run.config["budget.steps"], run.config.get("budget.flops")
     limits = [f"budget.steps={steps:,}"] if steps else []
     return " ".join([*limits, f"budget.flops={flops:g}"] if flops else limits) or "the whole plan"
 
 
 def unbalanced(facts: Facts) -> Iterator[str]:
-    """Name groups and seeds that an average leaves out, and keys that are not answered by themselves."""
+    """Name groups and seeds that an average leaves out, and keys without an answer of their own."""
     for answer in facts.answers:
         family = answer.family
         if family.left_out:
@@ -214,7 +214,7 @@ def unbalanced(facts: Facts) -> Iterator[str]:
 
 
 def moved_seeds(facts: Facts) -> Iterator[str]:
-    """Name groups with more seeds than the look of a verdict, and pairs whose seeds at a look are gone or changed."""
+    """Name groups with more seeds than their verdict's look, and pairs whose seeds have changed since a look."""
     late: dict[str, int] = {}
     for answer in facts.answers:
         for verdict in answer.decision.verdicts:
@@ -262,7 +262,7 @@ def mixed(facts: Facts) -> Iterator[str]:
 
 
 def shares(facts: Facts) -> Iterator[str]:
-    """Say which limit ended all runs, and what a run took on average."""
+    """Yield the limit that ended all runs, and the mean cost of a run."""
     ended = {*map(_ended_by, facts.trainings)}
     if len(ended) != 1 or len(facts.groups) < 2:
         return
@@ -308,7 +308,7 @@ def time_cap(facts: Facts) -> Iterator[str]:
 
 
 def other_players(facts: Facts) -> Iterator[str]:
-    """Name players of the same game, say where the random one's score is from, and why early scores are below it."""
+    """Name players of the same game, the source of the random player's score, and why early scores are below it."""
     references = facts.tables["references"]
     if players := [row for row in references if row["name"].endswith(", measured")]:
         scores = [f"{row['name'].removesuffix(', measured')} {row['score']:,.0f}" for row in players]
@@ -328,10 +328,10 @@ def other_players(facts: Facts) -> Iterator[str]:
 CAVEATS: Sequence[Note] = (
     *(stands, further_answers, conditions, unusual_runs, missing_seeds, modes_found, unlike, unbalanced, moved_seeds),
 )
-"""What may make a verdict mean something else."""
+"""The notes that may change the meaning of a verdict."""
 
 NOTES: Sequence[Note] = (shares, mixed, begun, survival_and_rate, time_cap, other_players)
-"""What is said after it."""
+"""The other notes."""
 
 
 def _values(keys: Mapping[str, Sequence[str]]) -> str:

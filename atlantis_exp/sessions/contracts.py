@@ -1,4 +1,4 @@
-"""The verb `check`: try each contract on the named components, then measure their cost next to ours."""
+"""Test each contract of the named components, then measure their cost next to that of built-in ones."""
 
 import copy
 import random
@@ -37,7 +37,7 @@ from atlantis_exp.training.checkpoint import Checkpoints, to_safetensors
 from atlantis_exp.training.fingerprint import fingerprint
 
 Contract = tuple[str, str, Callable[[], object]]
-"""A component, its contract, and a call that raises if the contract is broken."""
+"""A component, a contract, and a test that raises if the contract is broken."""
 
 _SIDES = (84, 159)  # pixels
 _ACTIONS = 4
@@ -50,7 +50,7 @@ _HEADS: dict[str, Head] = {
 
 
 def check(contracts: Iterator[Contract], measured: Mapping[str, Job]) -> None:
-    """Try every contract; if all are kept, measure the costs of trainings, by name. Raises: Fault otherwise."""
+    """Test every contract; if all are kept, measure the costs of trainings. Raises: Fault if one is broken."""
     tried, wanted, now = list[documents.Trial](), [*contracts], ""
     with terminal.working("checking", lambda: now):
         for number, (part, contract, trial) in enumerate(wanted, 1):
@@ -76,7 +76,7 @@ def check(contracts: Iterator[Contract], measured: Mapping[str, Job]) -> None:
 
 
 def contracts_of(config: Config, small: Job, kinds: Collection[str]) -> Iterator[Contract]:
-    """Yield every contract of a config's components of these kinds; `small` is a training of them of seconds."""
+    """Yield the contracts of a config's components of these kinds; `small` is a training that takes seconds."""
     import_components(config)
     if "model" in kinds:
         network = f"model={config.model.name}"
@@ -85,19 +85,19 @@ def contracts_of(config: Config, small: Job, kinds: Collection[str]) -> Iterator
                 for precision in ("fp32", "bf16"):
                     trial = partial(_learns, config, head, side, precision)
                     yield network, f"learns: {head}, {side} pixels, {precision}", trial
-        yield network, "the same seed, the same weights", partial(_same_weights, config)
-        yield network, "weights there and back, on meta too", partial(_weights_return, config)
-        yield network, "draws from no global stream", partial(_network_draws_nothing, config)
+        yield network, "same seed, same weights", partial(_same_weights, config)
+        yield network, "loads its saved weights, also on meta", partial(_weights_return, config)
+        yield network, "draws no global random numbers", partial(_network_draws_nothing, config)
         if config.model.component is not None and config.model.component.facts["splits_batches"]:
-            yield network, "a batch in parts is the batch", partial(_splits, config)
+            yield network, "a split batch gives the same values", partial(_splits, config)
     if "objective" in kinds:
         objective = f"objective={config.objective.name}"
-        yield objective, "targets and losses a sample, finite", partial(_objective_is_whole, config)
-        yield objective, "discount 0: rewards alone", partial(_objective_ends, config)
+        yield objective, "one finite target and loss per sample", partial(_objective_is_whole, config)
+        yield objective, "at discount 0 only rewards count", partial(_objective_ends, config)
     if "sampler" in kinds:
         for name, part in {part.name: part for part in map(config.sampler_of, config.phase)}.items():
-            yield f"sampler={name}", "a batch of available transitions", partial(_draws, config, part)
-            yield f"sampler={name}", "state there and back", partial(_sampler_continues, config, part)
+            yield f"sampler={name}", "draws available transitions", partial(_draws, config, part)
+            yield f"sampler={name}", "continues from its saved state", partial(_sampler_continues, config, part)
     if "epsilon" in kinds:
         trial = partial(_schedule_holds, config, config.epsilon, 1.0)
         yield f"epsilon={config.epsilon.name}", "in [0, 1], before and past the end", trial
@@ -106,7 +106,7 @@ def contracts_of(config: Config, small: Job, kinds: Collection[str]) -> Iterator
         yield f"lr_schedule={config.lr_schedule.name}", "finite, not negative", trial
     if "env" in kinds:
         yield f"env.id={config.env.id}", "actions are ALE's, points sum to rewards", partial(_pays, config)
-    yield "all", "killed and continued is unbroken, bit for bit", partial(_resumes, small)
+    yield "all", "killed and continued equals unbroken, bit for bit", partial(_resumes, small)
 
 
 def _hold(is_kept: object, otherwise: str) -> None:
@@ -170,7 +170,7 @@ def _no_global_stream() -> Iterator[None]:
     before = streams()
     yield
     moved = [name for name, a, b in zip(("torch", "numpy", "random"), before, streams(), strict=True) if a != b]
-    _hold(not moved, f"draws from the global stream of {', '.join(moved)}")
+    _hold(not moved, f"draws from the global generator of {', '.join(moved)}")
 
 
 def _network_draws_nothing(config: Config) -> None:
@@ -276,7 +276,7 @@ def _resumes(small: Job) -> None:
 
 
 def _train(small: Job, outputs: Path, kill: bool = False) -> bool:
-    """Train in a process of its own, with `kill` to the first commit; return whether it was killed. Raises: Fault."""
+    """Train in a new process; with `kill`, kill it at the first commit. Return whether it was killed. Raises: Fault."""
     own = replaced(small.overrides, f"paths.outputs={outputs}", "tracking.commit_seconds=1.0", "resume=auto")
     command = (sys.executable, "-m", "atlantis_exp", "train", *own)
     with (
@@ -293,12 +293,12 @@ def _train(small: Job, outputs: Path, kill: bool = False) -> bool:
             process.kill()
         if code not in (0, -signal.SIGKILL):
             said.seek(0)
-            raise Fault(f"a session failed: {(said.read().splitlines() or ['it said nothing'])[-1]}")
+            raise Fault(f"a session failed: {(said.read().splitlines() or ['it printed nothing'])[-1]}")
     return code != 0
 
 
 def fingerprints(config: Config, outputs: Path) -> dict[str, str]:
-    """Return the hashes of a training that has ended under `outputs`. Raises: Fault."""
+    """Return the hashes of an ended training under `outputs`. Raises: Fault."""
     memory = build_memory(config)
     folder = RunFolder(outputs / "runs" / config.run_name())
     state = Checkpoints(folder.checkpoints, config.identity()).load(memory)
@@ -308,7 +308,7 @@ def fingerprints(config: Config, outputs: Path) -> dict[str, str]:
 
 
 def _cost(name: str, job: Job, said: str) -> documents.Cost:
-    """Measure a training on this machine; an update includes the draw of its batch."""
+    """Measure a training on this machine; an update includes drawing its batch."""
     trainer, speed = measure(job, said=said)
     size, batch = job.config.env.size, job.config.training.batch_size
     return documents.Cost(

@@ -723,7 +723,7 @@ def test_runs_are_told_apart_by_the_device_that_auto_has_become(
         ("delta=-5%", "delta=-5%: write a share of a score, as in delta=5%, or points, as in delta=500"),
         ("delta=0", "delta=0: write"),
         ("runs=cnn,resnt", "runs=resnt: no such run under "),
-        ("where=env.crop=[1,2,3,4],model=cnn", "there is no finished training under "),
+        ("where=env.crop=[1,2,3,4],model=cnn", "no finished training under "),
         ("seeds=4", "seeds=4: should be greater than or equal to 5"),
         ("error=1", "error=1: should be less than 1"),
         ("look=later", "look=later: no such choice; no valid choice is near (valid: due, now)"),

@@ -53,7 +53,7 @@ def folder(tiny: Compose, tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("key", "value", "line"),
     [
-        ("sha256", "0" * 64, "does not have the checksum of its card"),
+        ("sha256", "0" * 64, "does not match the checksum in its card"),
         ("config.env.size", 84, "another network's"),
         ("config.env.siz", 40, "card.json: config.env.siz: no such key; did you mean 'size'?"),
         ("config.model._target_", "os.system", "card.json: config.model._target_: no such key"),
