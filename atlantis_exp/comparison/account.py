@@ -145,7 +145,7 @@ def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], 
         record[family.name], errors[family.name] = part.looks, part.error
         roots.append(other.root)
         if other.root != mine.name:
-            of = "" if part.of == 1 else f", of whose {part.of} pairs it is a part"
+            of = "" if part.of == 1 else f", which has {part.of} pairs in all"
             is_spent = part.error - sum(look.error for look in part.looks) < 1e-9
             left = "; to look further, allow a larger error=" if is_spent and _open(part.looks[-1]) else ""
             lines.append(f"By {family.name}, this continues the looks of {other.name}{of}{left}.")
@@ -163,7 +163,7 @@ def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], 
         questions = "1 other question" if len(told) == 1 else f"{len(told)} other questions"
         spent = f"{sum(told.values()):.2%}"
         lines.append(
-            f"These runs have been asked {questions}, which spent {spent}; the error of this one is on top of it."
+            f"{questions} about these runs spent {spent} of error; the error of this question is on top of it."
         )
     same = [other for other in others if {*other.identities.values()} == groups and mine.shares_runs(other)]
     if gone := sorted({*mine.compared}.union(*(other.compared for other in same)) - {*runs}):

@@ -80,7 +80,7 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
     scores = tables["scores"]
     add(
         *("scores", _scores, "Scores"),
-        "One dot a seed, the score as a diamond, with its 95 % interval from five seeds on; scores: "
+        "One dot per seed, the score as a diamond, with its 95 % interval from five seeds on; scores: "
         + _said([row["group"] for row in scores], scores, "score"),
         1.2 + 0.45 * len(scores),
     )
@@ -95,7 +95,7 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
         return drawn
     add(
         *("distribution", _distribution, "Distribution of the evaluated scores"),
-        "Histogram of evaluated scores, one step line a group; medians: "
+        "Histogram of evaluated scores, one step line per group; medians: "
         + _said(groups, tables["evaluation"], "median"),
     )
     add(

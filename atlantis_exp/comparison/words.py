@@ -70,7 +70,7 @@ def _undecided(answer: Answer, verdicts: Sequence[Verdict], in_full: bool) -> st
         return f"{text}; next look at {decision.next_look} seeds{which}"
     reach = max((verdict.detectable or 0.0 for verdict in verdicts), default=0.0)
     if not reach:
-        return f"{text}, and there is no further look; the detectable difference is unknown, for seeds do not differ"
+        return f"{text}, and there is no further look; the detectable difference is unknown, since seeds do not differ"
     return f"{text}, and there is no further look; a difference of {points(reach)} would have been found with 80 %"
 
 

@@ -289,8 +289,8 @@ def say_what_it_takes(contest: Contest) -> None:
         if family.plan.delta is not None:
             least = 100 * equivalence(family.plan, averaged, pairs)
             words += f", and no difference where delta is {least:.0f} % or more,"
-        say(f"{words} with 80 % at {looks[-1]} seeds")
-    say(f"(if a contender's seeds differ as {whence}: {100 * spread:.0f} % of their mean, standard deviation)")
+        say(f"{words} with a probability of 80 % at {looks[-1]} seeds")
+    say(f"(if the standard deviation over seeds is {100 * spread:.0f} % of the mean, as {whence})")
 
 
 def _spread(contest: Contest) -> tuple[float, str] | None:
@@ -311,14 +311,14 @@ def _spread(contest: Contest) -> tuple[float, str] | None:
         if len(set(scores)) > 2 and np.mean(scores) > 0:
             shares.append(float(np.std(scores, ddof=1) / np.mean(scores)))
     if shares:
-        return float(np.mean(shares)), "those that are there do"
+        return float(np.mean(shares)), "in the existing runs"
     # Of five seeds the range is 2.326 standard deviations on average.
     published = [
         (row["high"] - row["low"]) / 2.326 / row["mean"]
         for row in curves(contest.config.game)
         if row["source"].startswith("google/dopamine") and row["mean"] > 0
     ]
-    return (float(np.median(published)), "published ones do (Dopamine's agents, five seeds)") if published else None
+    return (float(np.median(published)), "in published runs (Dopamine's agents, five seeds)") if published else None
 
 
 def _write(journal: Journal, contest: Contest, comparison: Comparison) -> None:

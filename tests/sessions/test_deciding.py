@@ -207,7 +207,7 @@ def test_a_plan_whose_error_is_spent_trains_nothing_and_says_how_to_go_on(
     contest = asking("model=cnn,resnet", "seeds=20", "error=0.1")
     with pytest.raises(AssertionError):
         decide(contest, train)
-    assert "of the score is found with 80 % at 20 seeds" in " ".join(capsys.readouterr().out.split())
+    assert "of the score is found with a probability of 80 % at 20 seeds" in " ".join(capsys.readouterr().out.split())
 
 
 def test_several_keys_at_once_are_two_contenders(asking: Asking) -> None:
@@ -317,10 +317,9 @@ def test_before_it_starts_it_says_how_many_runs_there_may_be_and_what_they_can_f
     assert said(contest, capsys).splitlines() == [
         "cnn, resnet_fast: 10 to 20 runs, looks at 5 and 10 seeds each; 0 exist.",
         "4 trainings at a time, 2 cores each",
-        "a difference of 12 % of the score is found, and no difference where delta is 14 % or more, with 80 % at 10 "
-        "seeds",
-        "(if a contender's seeds differ as published ones do (Dopamine's agents, five seeds): 9 % of their mean, "
-        "standard deviation)",
+        "a difference of 12 % of the score is found, and no difference where delta is 14 % or more, with a "
+        "probability of 80 % at 10 seeds",
+        "(if the standard deviation over seeds is 9 % of the mean, as in published runs (Dopamine's agents, five seeds))",
     ]
     record_seeds(recorded, 1_000, range(2), "model=cnn")
     assert "published" in said(contest, capsys)
@@ -329,9 +328,9 @@ def test_before_it_starts_it_says_how_many_runs_there_may_be_and_what_they_can_f
     assert said(contest, capsys).splitlines() == [
         "cnn, resnet_fast: 10 to 20 runs, looks at 5 and 10 seeds each; 4 exist.",
         "4 trainings at a time, 2 cores each",
-        "a difference of 11 % of the score is found, and no difference where delta is 13 % or more, with 80 % at 10 "
-        "seeds",
-        "(if a contender's seeds differ as those that are there do: 8 % of their mean, standard deviation)",
+        "a difference of 11 % of the score is found, and no difference where delta is 13 % or more, with a "
+        "probability of 80 % at 10 seeds",
+        "(if the standard deviation over seeds is 8 % of the mean, as in the existing runs)",
     ]
     shown = said(asking("model=cnn,resnet_fast", "sampler=uniform,top_half", "seeds=5"), capsys).splitlines()
     assert shown[0].endswith("20 runs, looks at 5 seeds each; 4 exist.")

@@ -91,7 +91,7 @@ def test_an_export_of_what_began_with_weights_says_which_and_not_where(
     gathered = gather(tmp_path / "second")
     notes = compare(gathered, group(gathered.trainings, ["model"]), Question(["model"])).notes
     assert (
-        f"cnn began with {config.training.weights}; what that took counts in no frames, hours or arithmetic." in notes
+        f"cnn began with {config.training.weights}; frames, hours and FLOPs do not include their training." in notes
     )
 
 
