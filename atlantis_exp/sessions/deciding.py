@@ -318,7 +318,7 @@ def _spread(contest: Contest) -> tuple[float, str] | None:
         for row in curves(contest.config.game)
         if row["source"].startswith("google/dopamine") and row["mean"] > 0
     ]
-    return (float(np.median(published)), "in published runs (Dopamine's agents, five seeds)") if published else None
+    return (float(np.median(published)), "in published runs (Dopamine's, five seeds)") if published else None
 
 
 def _write(journal: Journal, contest: Contest, comparison: Comparison) -> None:

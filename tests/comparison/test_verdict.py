@@ -312,8 +312,7 @@ def test_looks_are_taken_where_they_are_planned_and_the_same_seeds_charge_nothin
     assert "5 seeds each); next look at 10 seeds (there are 7 each)." in between.verdict
     assert "more seeds" not in between.verdict
     assert (
-        "Verdicts use the seeds of their looks, scores all existing seeds: cnn has 7, resnet has 7."
-        in between.caveats
+        "Verdicts use the seeds of their looks, scores all existing seeds: cnn has 7, resnet has 7." in between.caveats
     )
 
     last = compared(runs(seeds), record=record_of(between))
@@ -454,9 +453,7 @@ def test_collapsed_policies_and_equal_scores_are_named() -> None:
 def test_runs_of_a_look_that_are_gone_or_score_otherwise_are_named() -> None:
     runs = [*around("cnn", 3_000.0, range(6)), *around("resnet", 5_000.0, range(6))]
     record = {each.family.name: each.decision.looks for each in compared(runs[:5] + runs[6:11]).answers}
-    said = (
-        "By model, runs of past looks are gone or have new scores, but their verdicts stay: cnn against resnet."
-    )
+    said = "By model, runs of past looks are gone or have new scores, but their verdicts stay: cnn against resnet."
     assert said not in compared(runs, record=record).caveats
     for others in ([of("resnet", 2, (1.0,) * 4)], []):
         comparison = compared([*runs[:8], *others, *runs[9:]], record=record)

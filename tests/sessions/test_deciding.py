@@ -319,7 +319,7 @@ def test_before_it_starts_it_says_how_many_runs_there_may_be_and_what_they_can_f
         "4 trainings at a time, 2 cores each",
         "a difference of 12 % of the score is found, and no difference where delta is 14 % or more, with a "
         "probability of 80 % at 10 seeds",
-        "(if the standard deviation over seeds is 9 % of the mean, as in published runs (Dopamine's agents, five seeds))",
+        "(if the standard deviation over seeds is 9 % of the mean, as in published runs (Dopamine's, five seeds))",
     ]
     record_seeds(recorded, 1_000, range(2), "model=cnn")
     assert "published" in said(contest, capsys)

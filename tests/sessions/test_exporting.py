@@ -90,9 +90,7 @@ def test_an_export_of_what_began_with_weights_says_which_and_not_where(
     assert str(tmp_path) not in (folder / "card.json").read_text()
     gathered = gather(tmp_path / "second")
     notes = compare(gathered, group(gathered.trainings, ["model"]), Question(["model"])).notes
-    assert (
-        f"cnn began with {config.training.weights}; frames, hours and FLOPs do not include their training." in notes
-    )
+    assert f"cnn began with {config.training.weights}; frames, hours and FLOPs do not include their training." in notes
 
 
 def test_weights_that_no_training_can_begin_with_are_one_line_and_leave_nothing(
