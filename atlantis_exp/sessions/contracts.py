@@ -109,7 +109,7 @@ def contracts_of(config: Config, small: Job, kinds: Collection[str]) -> Iterator
     yield "all", "killed and continued equals unbroken, bit for bit", partial(_resumes, small)
 
 
-def _hold(is_kept: object, otherwise: str) -> None:
+def _require(is_kept: object, otherwise: str) -> None:
     if not is_kept:
         raise Fault(otherwise)
 
@@ -133,14 +133,16 @@ def _learns(config: Config, head: str, side: int, precision: Any) -> None:
     optimizer = torch.optim.SGD(network.parameters(), lr=1e-3)
     learner = Learner(network, target, optimizer, objective, 1.0, precision=precision)
     states = np.random.default_rng(0).integers(0, 256, (6, config.env.stack, side, side), np.uint8)
-    _hold(learner.q_values(states).shape == (6, _ACTIONS), f"values of shape {learner.q_values(states).shape}")
+    _require(learner.q_values(states).shape == (6, _ACTIONS), f"values of shape {learner.q_values(states).shape}")
     before = copy.deepcopy(network.state_dict())
     rewards = np.arange(6, dtype=np.float32)
     errors = learner.update(states, np.arange(6) % _ACTIONS, rewards, states, np.full(6, 0.9, np.float32))
     after = network.state_dict()
-    _hold(errors.isfinite().all(), "an error is not finite")
-    _hold(all(value.isfinite().all() for value in after.values()), "a weight is not finite")
-    _hold(any(not torch.equal(before[name], after[name]) for name, _ in network.named_parameters()), "no weight moved")
+    _require(errors.isfinite().all(), "an error is not finite")
+    _require(all(value.isfinite().all() for value in after.values()), "a weight is not finite")
+    _require(
+        any(not torch.equal(before[name], after[name]) for name, _ in network.named_parameters()), "no weight moved"
+    )
 
 
 def _same_weights(config: Config) -> None:
@@ -170,7 +172,7 @@ def _no_global_stream() -> Iterator[None]:
     before = streams()
     yield
     moved = [name for name, a, b in zip(("torch", "numpy", "random"), before, streams(), strict=True) if a != b]
-    _hold(not moved, f"draws from the global generator of {', '.join(moved)}")
+    _require(not moved, f"draws from the global generator of {', '.join(moved)}")
 
 
 def _network_draws_nothing(config: Config) -> None:
@@ -205,10 +207,10 @@ def _objective_is_whole(config: Config) -> None:
         target = _targets(config, 0.9, 1)
         losses = build_component(config, config.objective).losses(q, torch.arange(6) % _ACTIONS, target)
         losses.mean().backward()
-    _hold(target.shape == (6, *q.shape[2:]), f"targets of shape {tuple(target.shape)}")
-    _hold(losses.shape == (6,), f"losses of shape {tuple(losses.shape)}")
-    _hold(losses.isfinite().all(), "a loss is not finite")
-    _hold(q.grad is not None and bool(q.grad.abs().sum() > 0), "no gradient")
+    _require(target.shape == (6, *q.shape[2:]), f"targets of shape {tuple(target.shape)}")
+    _require(losses.shape == (6,), f"losses of shape {tuple(losses.shape)}")
+    _require(losses.isfinite().all(), "a loss is not finite")
+    _require(q.grad is not None and bool(q.grad.abs().sum() > 0), "no gradient")
 
 
 def _objective_ends(config: Config) -> None:
@@ -229,8 +231,8 @@ def _draws(config: Config, part: ComponentConfig) -> None:
         drawn = sampler.sample(memory, 16, np.random.default_rng(0))
         if drawn.weights is not None:
             sampler.feed_back(drawn.ids, np.ones(16, np.float32))
-    _hold(drawn.ids.shape == (16,), f"{drawn.ids.shape} transitions for a batch of 16")
-    _hold(memory.available(drawn.ids).all(), "a transition that is not available")
+    _require(drawn.ids.shape == (16,), f"{drawn.ids.shape} transitions for a batch of 16")
+    _require(memory.available(drawn.ids).all(), "a transition that is not available")
 
 
 def _sampler_continues(config: Config, part: ComponentConfig) -> None:
@@ -244,14 +246,14 @@ def _sampler_continues(config: Config, part: ComponentConfig) -> None:
     other.load_state_dict(copy.deepcopy(sampler.state_dict()))
     for seed in range(3):
         ids = [each.sample(memory, 8, np.random.default_rng(seed)).ids for each in (sampler, other)]
-        _hold((ids[0] == ids[1]).all(), "draws other transitions than before")
+        _require((ids[0] == ids[1]).all(), "draws other transitions than before")
 
 
 def _schedule_holds(config: Config, part: ComponentConfig, highest: float) -> None:
     schedule = build_component(config, part)
     with _no_global_stream():
         values = [float(schedule(step / 100, 1_000 * step)) for step in range(151)]
-    _hold(all(0 <= value <= highest for value in values), f"{min(values)} to {max(values)}")
+    _require(all(0 <= value <= highest for value in values), f"{min(values)} to {max(values)}")
 
 
 def _pays(config: Config) -> None:
@@ -260,7 +262,7 @@ def _pays(config: Config) -> None:
     for _ in range(500):
         step = emulator.step(int(rng.integers(len(emulator.game.actions))))
         is_split = bool(emulator.game.sources)
-        _hold(not is_split or sum(step.points) == step.reward, f"{step.points} for a reward of {step.reward}")
+        _require(not is_split or sum(step.points) == step.reward, f"{step.points} for a reward of {step.reward}")
         if step.terminated or step.truncated:
             emulator.reset()
 
@@ -269,10 +271,10 @@ def _resumes(small: Job) -> None:
     with tempfile.TemporaryDirectory() as folder:
         whole, killed = Path(folder, "unbroken"), Path(folder, "killed")
         _train(small, whole)
-        _hold(_train(small, killed, kill=True), "the training was too short to be killed")
+        _require(_train(small, killed, kill=True), "the training was too short to be killed")
         _train(small, killed)
         one, other = fingerprints(small.config, whole), fingerprints(small.config, killed)
-    _hold(one == other, f"{', '.join(part for part in one if one[part] != other[part])} differ")
+    _require(one == other, f"{', '.join(part for part in one if one[part] != other[part])} differ")
 
 
 def _train(small: Job, outputs: Path, kill: bool = False) -> bool:

@@ -157,7 +157,7 @@ class Contest:
         """Return the training of a contender with a seed."""
         job = self.contenders[label]
         overrides = (*job.overrides, f"seed={seed}")
-        if any("${" in text for text in overrides):  # a value may follow from the seed; composing is slow
+        if any("${" in text for text in overrides):  # compose anew, since a value may follow from the seed
             return self._job_of(overrides)
         return replace(job, config=replace(job.config, seed=seed), overrides=overrides)
 

@@ -25,7 +25,7 @@ from atlantis_exp.sessions.launchers import BASIC, Launcher
 
 _ON_A_GPU = 4  # trainings that share one without loss: docs/performance.md
 _PROCESS_BYTES = 2**30  # of memory that a training takes besides its replay memory
-_COMPRESSED = 8  # observations shrink at least so many times, even whole screens
+_COMPRESSED = 8  # least compression of observations, also of whole screens
 
 
 class _Running:
