@@ -422,7 +422,7 @@ BROKEN = [  # what is in mynet.py instead of a part of it, the line that is to b
         "width: Width",
         "width: torch.Tensor",
         "@component",
-        r"TypeError: width: .*Tensor is not a type of a setting; use",
+        r"TypeError: width: .*Tensor cannot be a setting's type; use",
     ),
     ("width: Width", "width: np.ndarray", "def __init__", r"NameError: name 'np' is not defined"),
     ("width: Width", "width: 'a side of'", "@component", r"SyntaxError: "),
@@ -478,7 +478,7 @@ def test_a_head_of_quantiles_needs_their_number(plugins: Path, said: Said) -> No
     [
         ("plugins=./none.py", "/.*/none.py is not a file"),
         ("plugins=./other/mynet.py,mynet.py", r"mynet\.py: /.*/other/mynet\.py is called mynet, too; rename one"),
-        ("plugins=copy.py,mynet.py", r"/mynet.py:13: model=mynet is /.*/copy\.py's, too"),
+        ("plugins=copy.py,mynet.py", r"/mynet.py:13: model=mynet is also in /.*/copy\.py"),
         ("plugins=./my-net.py", r"write a file NAME\.py"),
         ("plugins=nothing", "no such distribution is installed"),
         ("plugins=3", "write files and distributions"),

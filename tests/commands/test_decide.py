@@ -29,7 +29,7 @@ Command = Callable[..., int]
         (("phase=single,two_phase",), "phase: is not a single key; name those that differ"),
         (("optimizer.lr=0.001,1e-3",), "optimizer.lr=0.001: the same contender as optimizer.lr=0.001"),
         (("env.workers=1,2",), "env.workers=2: makes the same run as env.workers=1"),
-        (("samplers.prioritized.alpha=0.4,0.6",), "samplers.prioritized.alpha=0.6: trains what samplers.prioritized."),
+        (("samplers.prioritized.alpha=0.4,0.6",), "samplers.prioritized.alpha=0.6: makes the same run as samplers.p"),
         (("optimizer.lr=0.001,0.002", "baseline=lr=0.003"), "baseline=lr=0.003: no such group; did you mean 'lr=0.00"),
         (("model=cnn,resnet", "baseline=resnte"), "baseline=resnte: no such group; did you mean 'resnet'?"),
         (
@@ -69,7 +69,7 @@ def test_a_question_that_cannot_be_decided_is_one_line_and_code_2_and_leaves_not
     [
         ("model=cnn model=cnn,resnet", "model=cnn,resnet: contradicts model=cnn"),
         ("model=cnn,resnet ++seed=3", "seed=3: decide trains seeds from 0 on"),
-        ("model=cnn,resnet ++resume=never", "resume=never: decide goes on"),
+        ("model=cnn,resnet ++resume=never", "resume=never: decide continues"),
         ("optimizer.lr=interval(0,1)", "optimizer.lr=interval(0,1): not a list of values; write them out"),
     ],
 )

@@ -252,7 +252,7 @@ def test_early_scores_below_random_come_with_the_reason(compared: Callable[..., 
 
 def test_a_late_curve_has_the_published_ones_next_to_it_and_no_excuse(compared: Callable[..., Comparison]) -> None:
     comparison = compared(curve=((0, 0, 0, 0), (12_000_000, 9, 9, 9_000)))
-    assert not any("normal so early" in note for note in comparison.notes)
+    assert not any("normal this early" in note for note in comparison.notes)
     assert {row["frames"] for row in comparison.tables["published_curves"]} == {1e6 * n for n in range(1, 11)}
 
 

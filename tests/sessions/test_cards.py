@@ -162,7 +162,7 @@ def test_a_folder_of_this_place_is_named_without_a_path(folder: Path, monkeypatc
     monkeypatch.chdir(folder.parent)
     ((_, config),) = check("evaluate", EvaluateConfig, ["weights=untrained"]).items()
     assert config.weights == "untrained"
-    with pytest.raises(ConfigError, match="weights=untraind: neither"):
+    with pytest.raises(ConfigError, match="weights=untraind: not a folder"):
         check("evaluate", EvaluateConfig, ["weights=untraind"])
 
 

@@ -95,7 +95,7 @@ BREACHES = [  # what a part is replaced by, and the contracts that it breaks
     (
         "(DQN):\n    pass",
         "(DQN):\n    def losses(self, *given):\n        return super().losses(*given).mean()",
-        ("targets and",),
+        ("one finite target",),
     ),
     (
         *(
