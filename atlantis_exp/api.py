@@ -1,7 +1,7 @@
-"""Train, evaluate and compare from Python, as the verbs of these names do at a command line.
+"""Train, evaluate and compare from Python.
 
-Each function takes a verb's overrides as they are typed, one text each. What a command line ends with an exit code is
-raised here: ConfigError for a mistake, Fault for what fails later, KeyboardInterrupt after a Ctrl-C has been committed.
+Each function takes the overrides of the verb of its name, one string each. It raises where the command line would exit:
+ConfigError for a mistake, Fault for a later failure, KeyboardInterrupt once a Ctrl-C has been committed.
 """
 
 from typing import TypeVar, cast
@@ -18,9 +18,9 @@ T = TypeVar("T")
 
 
 def train(*overrides: str) -> RunFolder:
-    """Train one network, continue it, or return it if its training has ended: `train("model=resnet", "seed=1")`.
+    """Train a network, or continue its training: `train("model=resnet", "seed=1")`.
 
-    Returns its folder: `.name`, `.path`, and `.result`, which is None as long as the training has not ended.
+    Returns the run's folder: `.name`, `.path`, and `.result`, which is None until the training has ended.
     """
     config, _ = _done(_training.VERB, overrides)
     return RunFolder.of(config)
@@ -29,22 +29,22 @@ def train(*overrides: str) -> RunFolder:
 def evaluate(*overrides: str) -> RunFolder:
     """Play a run's network or exported weights: `evaluate(f"run={run.name}", "episodes=20")`.
 
-    Returns the evaluation's folder, whose `.result.report` is the report's table.
+    Returns the evaluation's folder; `.result.report` is its table.
     """
     return cast(RunFolder, _done(_evaluating.VERB, overrides)[1])
 
 
 def compare(*overrides: str) -> Comparison:
-    """Compare finished runs, taking the looks that are due: `compare("by=model").verdict`. Tables are lists of rows."""
+    """Compare finished runs and take due looks: `compare("by=model").verdict`. Tables are lists of rows."""
     return cast(Comparison, _done(_comparing.VERB, overrides)[1])
 
 
 def _done(verb: Verb[T], overrides: tuple[str, ...]) -> tuple[T, object]:
-    """Return the checked config of one job, and what its verb returns."""
+    """Do a verb's one job; return its checked config and its result."""
     _, asked = verb.read(overrides)
     if len(asked) > 1:
         raise ConfigError(f"{' '.join(overrides)}: makes {len(asked)} jobs; call {verb.name} once for each")
     try:
         return asked[0].config, verb.work(asked[0])()
-    except SystemExit as end:  # what was interrupted is committed
+    except SystemExit as end:  # the interrupted run is committed
         raise KeyboardInterrupt from end

@@ -58,9 +58,9 @@ def build_game(component: Component) -> Game:
 
 
 def make_emulator(env: cfg.EnvConfig) -> partial[Emulator]:
-    """Return a call that makes one emulator, here or in a worker process. Raises: ConfigError."""
+    """Return a factory of one emulator, which can be sent to a worker process. Raises: ConfigError."""
     if (component := env.game) is None:
-        raise ConfigError(f"env.id={env.id}: its game is a plugin's; name it with plugins=")
+        raise ConfigError(f"env.id={env.id}: its game comes from a plugin; name that with plugins=")
     return partial(
         Emulator,
         game=build_game(component),
@@ -75,7 +75,7 @@ def make_emulator(env: cfg.EnvConfig) -> partial[Emulator]:
 
 
 def build_emulators(env: cfg.EnvConfig, cores: int, num_envs: int) -> Emulators:
-    """Return emulators, several in worker processes: one a core unless `env.workers` says otherwise."""
+    """Return emulators; several run in worker processes, one per core unless `env.workers` is set."""
     return make_emulators(make_emulator(env), num_envs, env.workers or cores)
 
 
@@ -105,7 +105,7 @@ def choose_precision(name: str, device: torch.device) -> str:
 
 
 def build_component(config: cfg.Config, part: cfg.ComponentConfig, *given: object) -> Any:
-    """Return a component of a config, made of `given` arguments and its settings.
+    """Build a component from the `given` arguments and its settings.
 
     Raises: ConfigError if its plugin is not named on the command line, or its code fails.
     """
@@ -117,7 +117,7 @@ def build_component(config: cfg.Config, part: cfg.ComponentConfig, *given: objec
 
 
 def described(config: cfg.Config) -> str:
-    """Return the plugins of a config in words: `mynet 0.3, sha 1a2b3c4d5e6f`."""
+    """Return a config's plugins as text: `mynet 0.3, sha 1a2b3c4d5e6f`."""
     return "; ".join(describe(name, each.version, each.sha256) for name, each in config.plugins.items())
 
 
@@ -132,7 +132,7 @@ def import_components(config: cfg.Config) -> None:
 
 
 def _check_output(config: cfg.Config, network: nn.Module) -> None:
-    """Raise ConfigError if a plugin's network does not take states, or does not return the shape of its head."""
+    """Raise ConfigError if a plugin's network fails on states or returns another shape than its head's."""
     component, env = config.model.component, config.env
     if component is None or component.plugin is None:
         return
@@ -142,9 +142,7 @@ def _check_output(config: cfg.Config, network: nn.Module) -> None:
     with component.blamed(), torch.no_grad():
         made = tuple(network.eval()(torch.zeros(2, env.stack, env.size, env.size)).shape)
         if made != shape:
-            raise TypeError(
-                f"{component.load().__name__} returns {made} for two states; it should be {shape}, the head's"
-            )
+            raise TypeError(f"{component.load().__name__} returns {made} for two states; should be {shape}")
 
 
 def _num_actions(config: cfg.Config) -> int:
@@ -155,27 +153,27 @@ def _num_actions(config: cfg.Config) -> int:
 
 
 def needs(config: cfg.Config) -> str:
-    """Return the line that says which plugins a config needs and how the named ones differ."""
+    """Return an error line: the plugins that a config needs, and how the named ones differ."""
     there = {each.plugin.name: each.plugin for each in admitted().values() if each.plugin}
     wanted = {name: describe(name, each.version, each.sha256) for name, each in config.plugins.items()}
     lacking = {name: text for name, text in wanted.items() if str(there.get(name)) != text}
     if not lacking:
         return f"env.id={config.env.id}: none of the plugins has this game"
-    given = [f"; {there[name].shown} is {there[name]}, which makes another run" for name in lacking if name in there]
+    given = [f"; {there[name].shown} is {there[name]}, another run" for name in lacking if name in there]
     names = [name if config.plugins[name].version else f"./{name}.py" for name in lacking]
     return f"needs plugins={','.join(names)} ({'; '.join(lacking.values())}){''.join(given)}"
 
 
 def build_network(config: cfg.Config, name: str, device: torch.device | None = None) -> nn.Module:
-    """Return a network on a device with weights from the named stream; leave the global generator as it was."""
+    """Return a network with weights from the named stream; leave the global generator unchanged."""
     if config.model.component is not None:
-        config.model.component.load()  # a module may draw when it is imported: before the weights are drawn
+        config.model.component.load()  # first, since a module may draw random numbers when imported
     initial, dropout = stream(config.seed, name).generate_state(2, np.uint64)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(initial >> np.uint64(1)))
         network = _architecture(config)
         _check_output(config, network)
-    network.to(device)  # before the generator is made, which stays where it is
+    network.to(device)  # first, since the generator of dropout stays on its device
     seed_dropout(network, int(dropout >> np.uint64(1)))
     return network
 
@@ -194,7 +192,7 @@ def _architecture(config: cfg.Config) -> nn.Module:
 
 
 def build_optimizer(optimizer: cfg.AdamConfig | cfg.RmsPropConfig, network: nn.Module) -> torch.optim.Optimizer:
-    """Return the optimizer of all of a network's parameters."""
+    """Return an optimizer of all parameters of a network."""
     settings = dataclasses.asdict(optimizer)
     name = settings.pop("name")
     settings["fused" if isinstance(optimizer, cfg.AdamConfig) else "foreach"] = True
@@ -202,7 +200,7 @@ def build_optimizer(optimizer: cfg.AdamConfig | cfg.RmsPropConfig, network: nn.M
 
 
 def build_learner(config: cfg.Config) -> Learner:
-    """Return both networks with the optimizer and the objective."""
+    """Return the learner: both networks, the optimizer and the objective."""
     device, target = choose_device(config.device), config.objective.target
     network = build_network(config, "network", device)
     target_network = build_network(config, "target", device)
@@ -224,14 +222,14 @@ def build_learner(config: cfg.Config) -> Learner:
 
 
 def choose_shards(config: cfg.Config, device: torch.device) -> int:
-    """Return the number of parts of a batch: one a thread, if the network allows it and lies on the CPU."""
+    """Return the number of parts to split a batch into: one per thread on a CPU, if the network allows it."""
     component = config.model.component
     is_split = device.type == "cpu" and component is not None and component.facts["splits_batches"]
     return (config.threads or OWN_THREADS) if is_split else 1
 
 
 def _compiled(network: nn.Module) -> nn.Module:
-    """Return a faster module of the same weights for batches of one size; on a GPU with CUDA graphs."""
+    """Compile a network for batches of one size, on a GPU with CUDA graphs."""
     on_gpu = next(network.parameters()).is_cuda
     return cast(nn.Module, torch.compile(network, dynamic=False, mode="reduce-overhead" if on_gpu else None))
 
@@ -266,13 +264,13 @@ def build_trained_network(config: cfg.Config, weights: bytes) -> nn.Module:
     """Return a trained network from its weights as safetensors. Raises: Fault if they are damaged or do not fit."""
     try:
         tensors = safetensors.torch.load(weights)
-        with torch.device("meta"):  # shapes first: a card may claim a network that no memory holds
+        with torch.device("meta"):  # check shapes first: a card may claim a network too large for memory
             _architecture(config).load_state_dict(tensors, assign=True)
         network = build_network(config, "network")
         network.load_state_dict(tensors)
         if not all(tensor.isfinite().all() for tensor in tensors.values()):
             raise Fault("the weights are not all finite numbers: their training diverged, or they are damaged")
-    except Fault:  # of a plugin
+    except Fault:  # from a plugin
         raise
     except (SafetensorError, RuntimeError) as error:
         raise Fault(f"the weights are damaged or another network's: {' '.join(str(error).split())}") from error
@@ -289,7 +287,7 @@ def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Acto
 
 
 def build_person(env: cfg.EnvConfig, choose: Callable[[npt.NDArray[np.uint8]], int]) -> tuple[PersonActor, Emulators]:
-    """Return a person at the keyboard, and the one emulator whose screen they see."""
+    """Return the actor of a person at the keyboard, and the emulator whose screen they see."""
     emulator = make_emulator(env)()
     return PersonActor(emulator.screen_rgb, choose), make_emulators(lambda: emulator, 1, 1)
 
@@ -302,7 +300,7 @@ def build_baseline(agent: cfg.BaselineAgentConfig, env: cfg.EnvConfig) -> Actor:
 def build_evaluator(env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig, cores: int) -> Evaluator:
     """Return the evaluator of this protocol, for any actor."""
     make = make_emulator(env)
-    workers = env.workers or max(1, cores - 1)  # one core is for the network, which decides meanwhile
+    workers = env.workers or max(1, cores - 1)  # leave one core to the network
     return Evaluator(
         make_emulators=lambda num_envs: make_emulators(make, num_envs, workers),
         make_emulator=make,
@@ -376,5 +374,5 @@ def build_trainer(
         max_flops=config.budget.flops,
     )
     if config.budget.flops is not None and not trainer.flops_per_update:
-        raise ConfigError(f"budget.flops: no FLOPs are counted of model={config.model.name}; use budget.steps")
+        raise ConfigError(f"budget.flops: the FLOPs of model={config.model.name} cannot be counted; use budget.steps")
     return trainer

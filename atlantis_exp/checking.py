@@ -1,4 +1,4 @@
-"""Plain mappings to checked configs, and mistakes to one line that names the key and the nearest valid choice."""
+"""Check mappings against config schemas; report a mistake in one line with its key and the nearest valid choice."""
 
 import dataclasses
 import difflib
@@ -28,7 +28,7 @@ def nearest(word: str, choices: Iterable[str]) -> str:
 
 
 def seconds(text: str | int) -> int:
-    """Return the seconds of a time such as 90, 90s, 10min, 3h or 1h30m; 0 if it is not readable."""
+    """Return a duration such as 90, 90s, 10min, 3h or 1h30m in seconds; 0 if it cannot be parsed."""
     if re.fullmatch(r"\d+", str(text)):
         return int(text)
     parts = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m(?:in)?)?(?:(\d+)s)?", str(text))
@@ -37,7 +37,7 @@ def seconds(text: str | int) -> int:
 
 
 def check_time(key: str, text: str | int | None, example: str) -> None:
-    """Raise ConfigError if a key does not hold a time of at most ten years."""
+    """Raise ConfigError unless a key holds a duration of at most ten years."""
     if text is None:
         return
     if not (length := seconds(text)):
@@ -47,7 +47,7 @@ def check_time(key: str, text: str | int | None, example: str) -> None:
 
 
 def share(key: str, text: str | float) -> float:
-    """Return a share, which may be written in percent. Raises: ConfigError."""
+    """Parse a share such as 20% or 0.2. Raises: ConfigError."""
     try:
         value = float(str(text).removesuffix("%")) / (100 if str(text).endswith("%") else 1)
     except ValueError:
@@ -58,25 +58,25 @@ def share(key: str, text: str | float) -> float:
 
 
 def absolute(key: str, text: str) -> Path:
-    """Return the path that a person typed, `~` filled in. Raises: ConfigError."""
+    """Return a typed path as an absolute one, with `~` expanded. Raises: ConfigError."""
     try:
         path = Path(text).expanduser().absolute()
         str(path).encode()
     except RuntimeError:
-        raise ConfigError(f"{key}={text}: there is no such user") from None
+        raise ConfigError(f"{key}={text}: no such user") from None
     except UnicodeEncodeError:
         raise ConfigError(f"{key}={text}: is in a folder whose name is not UTF-8; name another folder") from None
     return path
 
 
 def check_new(key: str, folder: Path) -> None:
-    """Raise ConfigError if a folder to be filled exists and is not empty."""
+    """Raise ConfigError if a new folder exists and is not empty."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(f"{key}={folder}: is not empty; name another folder")
 
 
 def check_server(key: str, uri: str | None) -> None:
-    """Raise ConfigError if a key does not hold a server's address, without a password: it is written to files."""
+    """Raise ConfigError unless a key holds a server's address without a password, since it is written to files."""
     if uri is not None and not re.fullmatch(r"https?://[^\s@?#]+", uri):
         raise ConfigError(
             f"{key}: should be null or a server's address, as in http://127.0.0.1:5000; user and password "
@@ -90,12 +90,12 @@ def parse(schema: type[T], tree: Mapping[str, Any]) -> T:
     text = json.dumps(tree)
     try:
         return TypeAdapter(schema).validate_json(text)
-    except ValidationError as error:  # whose keys are JSON's, which are texts
+    except ValidationError as error:  # its keys are strings, as in JSON
         raise ConfigError(_explain(error.errors(include_url=False), json.loads(text))) from None
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """Return a config as containers that JSON can hold."""
+    """Return a config as plain JSON containers."""
     tree: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config)))
     return tree
 
@@ -127,7 +127,7 @@ def _explain(faults: list[ErrorDetails], tree: Mapping[str, Any]) -> str:
     if kind == "unexpected_keyword_argument":
         return f"{key}: no such key; {nearest(path[-1], set(siblings) - {path[-1]})}"
     if kind in ("missing_argument", "missing"):
-        return f"{key}: missing, and it has no default"
+        return f"{key}: missing; it has no default"
     if kind == "union_tag_invalid":
         tags = str(fault["ctx"]["expected_tags"]).replace("'", "").split(", ")
         given = str(fault["ctx"]["tag"])
@@ -135,7 +135,7 @@ def _explain(faults: list[ErrorDetails], tree: Mapping[str, Any]) -> str:
     if kind == "literal_error":
         choices = str(fault["ctx"]["expected"]).replace("'", "").replace(" or ", ", ").split(", ")
         return f"{key}={node}: no such choice; {nearest(str(node), choices)}"
-    # A key that may hold one type or another has a fault for each.
+    # A union has a fault for each of its types.
     here = [other for other in faults if _locate(other, tree)[0] == path]
     is_whole = isinstance(node, float) and node.is_integer() and abs(node) < 2**63
     if is_whole and any(other["type"] == "int_type" for other in here):
@@ -148,12 +148,12 @@ def _explain(faults: list[ErrorDetails], tree: Mapping[str, Any]) -> str:
 
 
 def _locate(fault: ErrorDetails, tree: Mapping[str, Any]) -> tuple[list[str], Mapping[str, Any], Any]:
-    """Return a fault's key as the user knows it, the mapping that holds it, and its value."""
+    """Return a fault's key as the user wrote it, the mapping that holds it, and its value."""
     path: list[str] = []
     node: Any = tree
     siblings: Mapping[str, Any] = tree
     for part in fault["loc"]:
-        # Pydantic puts the name of a union's member into the path, which is not a key of the tree.
+        # Pydantic's path also names the member of a union, which is not a key of the tree.
         if isinstance(node, Mapping):
             siblings = node
             if part in node:

@@ -1,7 +1,7 @@
-"""Components by kind and name: the classes that a config can name, ours and those of plugins.
+"""Look up components by kind and name: the built-in classes that a config can name, and those of plugins.
 
-A plugin is imported when the command line admits it; nothing read from disk or from a server can. A class of ours is
-imported when it is built: `built_in` declares its settings, so that a config is checked without torch.
+Only the command line admits a plugin, which is then imported; a file or a server cannot. A built-in class is imported
+when it is built: `built_in` declares its settings, so that a config is checked without torch.
 """
 
 import hashlib
@@ -32,7 +32,7 @@ from atlantis_exp.games import Game
 C = TypeVar("C", bound=type)
 
 ENTRY_POINTS: Final = "atlantis_exp.plugins"
-"""The group of the entry points by which an installed distribution names its modules with components."""
+"""The group of entry points that name an installed distribution's modules with components."""
 NAME: Final = r"^[a-z][a-z0-9_]{0,39}$"
 """The form of a component's or a setting's name: they become run folders and config keys."""
 
@@ -41,9 +41,9 @@ Count = Annotated[int, Interval(ge=1, le=10**12)]
 Positive = Annotated[float, Interval(gt=0, le=1_000)]
 Probability = Annotated[float, Interval(ge=0, le=1)]
 Share = Annotated[float, Interval(gt=0, lt=1)]
-# Types of our own settings whose classes need torch or numpy.
+# Types of settings of built-in classes that need torch or numpy.
 Oversample = Annotated[int, Interval(ge=2, le=64)]
-Quantiles = Annotated[int, Interval(ge=1, le=1_000)]  # a sample of an update holds N x N differences
+Quantiles = Annotated[int, Interval(ge=1, le=1_000)]  # an update holds N x N differences per sample
 Rescaling = Literal["signed_sqrt", "symlog"]
 
 
@@ -54,7 +54,7 @@ class _NoFacts:
 
 @dataclass(frozen=True)
 class _NetworkFacts:
-    input_size: int = 84  # pixels a side that it is made for
+    input_size: int = 84  # pixels per side that it is made for
     smallest_side: int = 1  # pixels
     splits_batches: bool = False  # whether the output for a sample depends on that sample alone
 
@@ -68,7 +68,7 @@ class _ObjectiveFacts:
 class Kind:
     """A kind of component: the contract of its classes."""
 
-    given: int = 0  # arguments of the constructor ahead of the settings
+    given: int = 0  # constructor arguments before the settings
     facts: type = _NoFacts  # class attributes, with their defaults
     methods: tuple[str, ...] = ()  # with their arguments
 
@@ -94,9 +94,9 @@ KINDS: Final = {
 class Plugin:
     """A file or an installed distribution with components."""
 
-    name: str  # of the file without its ending, or of the distribution
+    name: str  # the file's stem, or the distribution
     version: str | None  # of the distribution
-    sha256: str  # of the file, or of all of the package's
+    sha256: str  # of the file, or of all files of its packages
     shown: str  # as on the command line
     roots: tuple[Path, ...]  # the file, or the folders of its packages
     text: bytes | None = None  # of the file
@@ -106,7 +106,7 @@ class Plugin:
 
     @contextmanager
     def blamed(self, place: str) -> Iterator[None]:
-        """Turn any error but a Fault into a ConfigError with the file and line of the plugin, or else `place`."""
+        """Turn any error except a Fault into a ConfigError with the plugin's file and line, or else `place`."""
         try:
             yield
         except Fault:
@@ -140,7 +140,7 @@ class Component:
     settings: tuple[Setting, ...]
     facts: Mapping[str, Any]
     load: Callable[[], type[Any]]  # imports it
-    plugin: Plugin | None = None  # None: it is ours
+    plugin: Plugin | None = None  # None: built in
 
     def data_path(self, name: str) -> Path:
         """Return the path of a file next to the source: for `pong` and `scores.csv`, `pong_scores.csv`."""
@@ -152,7 +152,7 @@ class Component:
 
 
 def component(name: str, *kinds: str) -> Callable[[C], C]:
-    """Name a plugin's class as a component of these kinds: `@component("mynet", "model")`."""
+    """Make a plugin's class a component of these kinds: `@component("mynet", "model")`."""
     if not re.fullmatch(NAME, name):
         raise ValueError(f"'{name}': a name has lowercase letters, digits and underscores, at most 40")
     for kind in kinds or ("",):
@@ -168,13 +168,13 @@ def component(name: str, *kinds: str) -> Callable[[C], C]:
 
 
 def describe(name: str, version: str | None, sha256: str) -> str:
-    """Return the name that people read: `mynet 0.3, sha 1a2b3c4d5e6f`."""
+    """Return a plugin's name for people: `mynet 0.3, sha 1a2b3c4d5e6f`."""
     return f"{name}{f' {version}' if version else ''}, sha {sha256[:12]}"
 
 
 @cache
 def built_in() -> Mapping[tuple[str, str], Component]:
-    """Return our own components by kind and name."""
+    """Return the built-in components by kind and name."""
     rescaled: dict[str, Any] = {"rescaling": Rescaling}
     quantiles: dict[str, Any] = {"quantiles": Quantiles, "head": "quantile"}
     ours = [
@@ -204,7 +204,7 @@ def built_in() -> Mapping[tuple[str, str], Component]:
 
 
 def _ours(kind: str, name: str, place: str, **declared: Any) -> Component:
-    """Return a component of ours with its declared settings and facts; those of a light class are read from it."""
+    """Return a built-in component with its declared settings and facts; read those of a class that imports fast."""
     module, _, class_name = place.rpartition(".")
 
     def load() -> type[Any]:
@@ -231,7 +231,7 @@ def _settings(count: int, cls: type[Any]) -> Iterator[Setting]:
     arguments = [*inspect.signature(cls).parameters.values()]
     given = [each for each in arguments if each.kind in (each.POSITIONAL_ONLY, each.POSITIONAL_OR_KEYWORD)]
     if len(given) < count and not any(each.kind == each.VAR_POSITIONAL for each in arguments):
-        raise TypeError(f"__init__ takes {len(given)} arguments; it is given {count}")
+        raise TypeError(f"__init__ takes {len(given)} arguments but gets {count}")
     types = get_type_hints(cls.__init__, include_extras=True)
     for each in arguments:
         if each in given[:count] or each.kind in (each.VAR_POSITIONAL, each.VAR_KEYWORD):
@@ -245,14 +245,14 @@ def _settings(count: int, cls: type[Any]) -> Iterator[Setting]:
             raise TypeError(f"{each.name}: has no type; write {each.name}: int")
         if not _is_plain(types[each.name]):
             raise TypeError(
-                f"{each.name}: {inspect.formatannotation(each.annotation)} is not a type of a setting; use int, "
+                f"{each.name}: {inspect.formatannotation(each.annotation)} cannot be a setting's type; use int, "
                 "float, bool, str, Literal[...], tuple[...], one of these | None, Annotated[int, Interval(ge=1)]"
             )
         yield Setting(each.name, types[each.name], MISSING if each.default is each.empty else each.default)
 
 
 def _check(kind: str, cls: type[Any], settings: Sequence[Setting], facts: Mapping[str, Any]) -> None:
-    """Raise TypeError if a plugin's class would fail later: its defaults, facts or methods' signatures."""
+    """Raise TypeError for defaults, facts or signatures of a plugin's class that would fail later."""
     for each in settings:
         if each.default is not MISSING:
             try:
@@ -274,14 +274,14 @@ def _check(kind: str, cls: type[Any], settings: Sequence[Setting], facts: Mappin
             raise TypeError(f"needs a method {method}({', '.join(['self', *arguments])})") from None
     quantiles = {each.name: each.type for each in settings}.get("quantiles")
     if facts.get("head") == "quantile" and getattr(quantiles, "__origin__", quantiles) is not int:
-        raise TypeError('head = "quantile" needs a setting quantiles: int, their number')
+        raise TypeError('head = "quantile" needs a setting quantiles: int')
     if kind == "env":
         _check_game(cls, settings)
 
 
 def _check_game(cls: type[Any], settings: Sequence[Setting]) -> None:
     if settings:
-        raise TypeError(f"{settings[0].name}: a game has no settings; they are those of conf/env")
+        raise TypeError(f"{settings[0].name}: a game takes no settings; they belong in conf/env")
     for fact, example in (("actions", '("NOOP", "FIRE")'), ("score_range", "(0.0, 400.0)")):
         if not hasattr(cls, fact):
             raise TypeError(f"{fact}: missing; write {fact} = {example}")
@@ -312,7 +312,7 @@ def _is_plain(told: Any) -> bool:
 
 
 _TAKEN = ("component", "defaults", "name", "own", "settings")
-"""Keys that a config has for every component."""
+"""Keys of every component's config."""
 
 
 _references: tuple[str, ...] = ()
@@ -320,10 +320,10 @@ _admitted: Mapping[tuple[str, str], Component] = {}
 
 
 def admit(references: Sequence[str]) -> None:
-    """Import the plugins that a command line names, in place of those admitted before.
+    """Import the plugins that a command line names, and drop those admitted before.
 
-    references: files, as ./mynet.py, or names of installed distributions. The same ones again are not read again, so
-    that a sweep trains one version.
+    references: files such as ./mynet.py, or names of installed distributions. The same references are read only once,
+    so that a sweep trains one version.
 
     Raises: ConfigError if a plugin cannot be imported or breaks a contract, or a name is taken.
     """
@@ -340,16 +340,16 @@ def admit(references: Sequence[str]) -> None:
         offered = [each for load in loads for each in _components(plugin, load)]
         if not offered:
             raise ConfigError(
-                f'plugins={reference}: names no component; put @component("NAME", "KIND") before a class, '
-                f"KIND being one of {', '.join(KINDS)}"
+                f'plugins={reference}: has no component; put @component("NAME", "KIND") before a class '
+                f"(kinds: {', '.join(KINDS)})"
             )
         for each in offered:
             where, what = f"{each.path}:{each.line}", f"{each.kind}={each.name}"
             if (each.kind, each.name) in built_in():
-                raise ConfigError(f"{where}: {what} is built in and is not replaced; give yours another name")
+                raise ConfigError(f"{where}: {what} is built in and cannot be replaced; rename yours")
             taken = found.setdefault((each.kind, each.name), each)
             if taken.load() is not each.load():
-                raise ConfigError(f"{where}: {what} is {taken.path}'s, too; give one of them another name")
+                raise ConfigError(f"{where}: {what} is also in {taken.path}; rename one of them")
     _references, _admitted = given, found
 
 
@@ -385,7 +385,7 @@ def facts_of(game: Component | None) -> Game:
 
 
 def points_of(game: Component) -> Callable[[int, Any], Sequence[float]]:
-    """Return the function that splits a frame's reward; worker processes can be sent it."""
+    """Return the function that splits a frame's reward; it can be sent to worker processes."""
     cls = game.load()
     points: Callable[[int, Any], Sequence[float]] = cls.points
     text = game.plugin.text if game.plugin else None
@@ -399,7 +399,7 @@ def _points(path: Path, text: bytes, class_name: str, reward: int, ram: Any) -> 
 
 
 def _load(path: Path, text: bytes) -> ModuleType:
-    """Return a file's module, run once as the bytes that were read and hashed."""
+    """Return a file's module, run once from the bytes that were hashed."""
     name = f"atlantis_exp_plugin_{path.stem}"
     own = {"__file__": str(path), "__text__": text}
     if (loaded := sys.modules.get(name)) is not None and own.items() <= vars(loaded).items():
@@ -407,7 +407,7 @@ def _load(path: Path, text: bytes) -> ModuleType:
     loaded = ModuleType(name)
     vars(loaded).update(own)
     code = compile(text, str(path), "exec")
-    sys.modules[name] = loaded  # where dataclasses look for the types of their fields
+    sys.modules[name] = loaded  # dataclasses look up the types of their fields here
     try:
         exec(code, vars(loaded))
     except BaseException:
@@ -417,7 +417,7 @@ def _load(path: Path, text: bytes) -> ModuleType:
 
 
 def installed() -> dict[str, list[str]]:
-    """Return the names of the components that each installed distribution offers; import nothing."""
+    """Return the component names of each installed distribution; import nothing."""
     offered: dict[str, list[str]] = {}
     for point in entry_points(group=ENTRY_POINTS):
         if point.dist is not None:
@@ -431,7 +431,7 @@ def _components(plugin: Plugin, load: Callable[[], ModuleType]) -> Iterator[Comp
         module = load()
     top = module.__name__.partition(".")[0]
     for cls in vars(module).values():
-        # Neither imported classes nor those that only inherit from a component.
+        # Skip imported classes, and subclasses of components.
         if isinstance(cls, type) and cls.__module__.partition(".")[0] == top and "__component__" in vars(cls):
             name, kinds, line = vars(cls)["__component__"]
             path = Path(str(sys.modules[cls.__module__].__file__))
@@ -447,7 +447,7 @@ def _plugin(reference: str) -> tuple[Plugin, list[Callable[[], ModuleType]]]:
     if "/" in reference or reference.endswith(".py"):
         path = absolute("plugins", reference)
         if not re.fullmatch(r"[A-Za-z_]\w{0,79}", path.stem, re.ASCII) or path.suffix != ".py":
-            raise ConfigError(f"plugins={reference}: write a file NAME.py, its name of letters, digits and underscores")
+            raise ConfigError(f"plugins={reference}: name a file NAME.py, with letters, digits and underscores in NAME")
         text = _read(reference, path)
         plugin = Plugin(path.stem, None, hashlib.sha256(text).hexdigest(), reference, (path,), text)
         return plugin, [partial(_load, path, text)]
@@ -455,21 +455,21 @@ def _plugin(reference: str) -> tuple[Plugin, list[Callable[[], ModuleType]]]:
         package = distribution(reference)
     except (PackageNotFoundError, ValueError):
         names = installed()
-        hint = nearest(reference, names) if names else "a file is written with its ending, as in ./mynet.py"
+        hint = nearest(reference, names) if names else "write a file with its ending, as in ./mynet.py"
         raise ConfigError(f"plugins={reference}: no such distribution is installed; {hint}") from None
     return _package(reference, package)
 
 
 def _package(reference: str, package: Distribution) -> tuple[Plugin, list[Callable[[], ModuleType]]]:
-    """Return a distribution with the hash of the packages that its entry points name, and as `_plugin`."""
+    """Do the same for a distribution, hashed over the packages that its entry points name."""
     modules = sorted({point.module for point in package.entry_points.select(group=ENTRY_POINTS)})
     if not modules:
         raise ConfigError(f"plugins={reference}: it has no entry point in the group {ENTRY_POINTS}")
     hashed, roots = hashlib.sha256(), []
     for top in sorted({module.partition(".")[0] for module in modules}):
-        spec = find_spec(top)  # imports nothing, since it has no parent
+        spec = find_spec(top)  # imports nothing for a top-level name
         if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
-            raise ConfigError(f"plugins={reference}: its entry point names {top}, which is not there as source")
+            raise ConfigError(f"plugins={reference}: its entry point names {top}, whose source is missing")
         path = Path(spec.origin)
         is_package = path.name == "__init__.py"
         roots.append(path.parent if is_package else path)

@@ -1,7 +1,6 @@
-"""The schema of a composed experiment: types, ranges and cross-field checks.
+"""Define the schema of an experiment: types, ranges and cross-field checks.
 
-A plain nested mapping enters, a checked `Config` leaves. Knows no Hydra and no torch, so that a config read back from a
-stored run passes through the same door as one typed on a command line.
+It knows neither Hydra nor torch: a config from a stored run passes the same checks as one from a command line.
 """
 
 import dataclasses
@@ -33,17 +32,17 @@ from atlantis_exp.components import (
 )
 from atlantis_exp.faults import ConfigError
 
-# Built when a config is parsed: all verbs' together take a tenth of a second.
+# Deferred, since the schemas of all verbs together take a tenth of a second to build.
 STRICT = ConfigDict(defer_build=True, strict=True, extra="forbid", allow_inf_nan=False)
 
 Frameskip = Annotated[int, Field(ge=1, le=256)]
-_MOST_GAMES = 64  # that an evaluation plays side by side
+_MOST_GAMES = 64  # of an evaluation, side by side
 Episodes = Annotated[int, Field(ge=1, le=10**6)]  # of one evaluation
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Size = Annotated[int, Field(ge=8, le=210)]
 Rate = Annotated[float, Field(ge=1e-10, le=10)]
 Scale = Annotated[float, Field(ge=1e-9, le=1e9)]
-Format = Literal["text", "json"]  # of what a verb prints
+Format = Literal["text", "json"]  # of a verb's output
 
 
 def _check_device(device: str) -> str:
@@ -57,9 +56,9 @@ def _check_device(device: str) -> str:
 Device = Annotated[str, AfterValidator(_check_device)]
 
 FREE = frozenset(("plugins", "resume", "device", "threads", "compile", "tracking", "budget", "paths"))
-"""Keys that say how a run is done, not what is trained; the plugins that a run uses do count."""
+"""Keys that are not part of a run's identity; of `plugins`, those that the run uses are."""
 
-_INDEX_BYTES = 23  # of the replay memory, an observation
+_INDEX_BYTES = 23  # of the replay memory, per observation
 SCREEN = (210, 160)  # rows, columns of the emulator's screen
 
 
@@ -68,32 +67,32 @@ class EnvConfig:
     """One game and how its screen becomes an observation (report figure 2.3)."""
 
     id: Annotated[str, Field(pattern=r"^[\w/.-]{1,100}$")]  # Gymnasium's, which names the game
-    frameskip: Frameskip | tuple[Frameskip, Frameskip]  # frames a step; a pair is drawn from [low, high)
+    frameskip: Frameskip | tuple[Frameskip, Frameskip]  # frames per step; a pair: drawn from [low, high)
     sticky: Probability
-    max_frames: Annotated[int, Field(ge=1, lt=2**31)]  # frames an episode
-    max_steps: Count | None  # steps an episode
+    max_frames: Annotated[int, Field(ge=1, lt=2**31)]  # frames per episode
+    max_steps: Count | None  # steps per episode
     noop_max: Annotated[int, Field(ge=0, le=30)]  # frames
     max_pool: bool
     crop: tuple[int, int, int, int]  # UP, RIGHT, DOWN, LEFT: screen[UP:DOWN, LEFT:RIGHT]
     size: Size  # pixels
     stack: Annotated[int, Field(ge=1, le=8)]  # observations
     num_envs: Annotated[int, Field(ge=1, le=64)]
-    workers: Annotated[int, Field(ge=1, le=64)] | None  # processes; null: one a core, in evaluations one fewer
+    workers: Annotated[int, Field(ge=1, le=64)] | None  # processes; null: one per core, in evaluations one fewer
 
     def __post_init__(self) -> None:
         rows, columns = SCREEN
         up, right, down, left = self.crop
         if not (0 <= up < down <= rows and 0 <= left < right <= columns):
             raise ConfigError(
-                f"env.crop={list(self.crop)}: (UP, RIGHT, DOWN, LEFT) leaves nothing or leaves the screen; "
-                f"need 0 <= UP < DOWN <= {rows} and 0 <= LEFT < RIGHT <= {columns}, as [0, {columns}, {rows}, 0]"
+                f"env.crop={list(self.crop)}: should be (UP, RIGHT, DOWN, LEFT) within the screen: "
+                f"0 <= UP < DOWN <= {rows} and 0 <= LEFT < RIGHT <= {columns}, as [0, {columns}, {rows}, 0]"
             )
         if isinstance(self.frameskip, tuple) and self.frameskip[0] >= self.frameskip[1]:
             raise ConfigError(
-                f"env.frameskip={list(self.frameskip)}: drawn from [low, high), so low must be under high"
+                f"env.frameskip={list(self.frameskip)}: drawn from [low, high), so low must be less than high"
             )
         if self.noop_max >= self.max_frames:
-            raise ConfigError(f"env.noop_max={self.noop_max}: leaves nothing of env.max_frames={self.max_frames}")
+            raise ConfigError(f"env.noop_max={self.noop_max}: should be less than env.max_frames={self.max_frames}")
         if self.max_pool and (isinstance(self.frameskip, tuple) or self.frameskip < 2):
             raise ConfigError(
                 "env.max_pool=true: needs one fixed env.frameskip of at least 2, as in env=atlantis_standard"
@@ -110,7 +109,7 @@ class EnvConfig:
 
 
 def _check_game(env: EnvConfig, info: ValidationInfo) -> EnvConfig:
-    """Raise ConfigError for an unknown game, unless it may come from one of a run's plugins."""
+    """Raise ConfigError for an unknown game that cannot come from a run's plugins."""
     if env.game is None and not (info.data.get("plugins") and re.fullmatch(r"(ALE/)?[A-Z][A-Za-z0-9]*-v\d", env.id)):
         ids = [each for name in known("env") for each in game_ids(name)]
         raise ConfigError(f"env.id={env.id}: no such choice; {nearest(env.id, ids)}")
@@ -118,7 +117,7 @@ def _check_game(env: EnvConfig, info: ValidationInfo) -> EnvConfig:
 
 
 Env = Annotated[EnvConfig, AfterValidator(_check_game)]
-"""An environment whose game is known, or a plugin's that the run was trained with."""
+"""An environment whose game is known, or may come from the run's plugins."""
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -148,7 +147,7 @@ class ModelConfig(ComponentConfig):
 class TargetConfig:
     """The target network: how it starts, follows and normalises."""
 
-    tau: Annotated[float, Field(ge=1e-6, le=1)]  # share of the policy network taken over; less is lost in float32
+    tau: Annotated[float, Field(ge=1e-6, le=1)]  # share of the policy network; smaller ones vanish in float32
     every: Count  # updates
     mode: Literal["eval", "train"]
     start: Literal["copy", "independent"]
@@ -180,7 +179,7 @@ class AdamConfig:
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class RmsPropConfig:
-    """RMSProp, centred as in the DQN papers when asked."""
+    """RMSProp, optionally centred as in the DQN papers."""
 
     name: Literal["rmsprop"]
     lr: Rate
@@ -195,7 +194,7 @@ OptimizerConfig = Annotated[AdamConfig | RmsPropConfig, Field(discriminator="nam
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class PluginConfig:
-    """A plugin that a run was trained with, as it was then."""
+    """A plugin, as it was when a run was trained with it."""
 
     version: Annotated[str, Field(pattern=r"^[\w.+!-]{1,60}$")] | None  # of the distribution; null: a file
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -203,7 +202,7 @@ class PluginConfig:
 
 Plugins = dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_][\w.-]{0,99}$")], PluginConfig]
 
-_MOST_SETTINGS = 100  # of a component that is not known here
+_MOST_SETTINGS = 100  # of an unknown component
 _Value = bool | Annotated[int, Field(ge=-(2**63), lt=2**63)] | float | str | None
 _BASES: dict[str, type[ComponentConfig]] = {"model": ModelConfig, "objective": ObjectiveConfig}
 
@@ -217,9 +216,9 @@ def _schema(component: Component) -> TypeAdapter[ComponentConfig]:
 
 
 def _unknown_schema(kind: str, names: Collection[str]) -> TypeAdapter[ComponentConfig]:
-    """Return the schema of a component whose class is not known here: plain values, which can be compared."""
+    """Return the schema of a component whose class is unknown: plain values, which can be compared."""
     if len(names) > _MOST_SETTINGS or any(iskeyword(name) or not re.fullmatch(NAME, name) for name in names):
-        raise ConfigError(f"{kind}: has no settings of a component, or more than {_MOST_SETTINGS}")
+        raise ConfigError(f"{kind}: not the settings of a component, or more than {_MOST_SETTINGS}")
     return _extended(kind, dict.fromkeys(names, _Value | list[_Value]), {})
 
 
@@ -232,7 +231,7 @@ def _extended(kind: str, types: Mapping[str, Any], attributes: Mapping[str, Any]
 
 
 def _component(kind: str) -> PlainValidator:
-    """Return the validator of a component's config, which checks it by the settings of the component's class."""
+    """Return the validator of a component's config, which checks it against the settings of the class."""
     base = _BASES.get(kind, ComponentConfig)
     common = {each.name for each in dataclasses.fields(base)}
 
@@ -265,7 +264,7 @@ def _is_recorded(plugin: Plugin, plugins: Mapping[str, PluginConfig]) -> bool:
 
 
 def record_plugins(tree: dict[str, Any]) -> None:
-    """Write the admitted plugins whose components a composed config names into it."""
+    """Record in a composed config the plugins whose components it names."""
     samplers = tree["samplers"] if isinstance(tree.get("samplers"), dict) else {}
     named = [(kind, tree.get(kind)) for kind in KINDS] + [("sampler", each) for each in samplers.values()]
     found = [known(kind).get(str(part.get("name"))) for kind, part in named if isinstance(part, dict)]
@@ -291,14 +290,14 @@ PINNED = r"^[^\x00-\x1f]{1,1000}@[0-9a-f]{16}$"
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class TrainingConfig:
-    """When and on how much the learner learns."""
+    """When the learner learns, and from how much."""
 
     learn_every: Count  # steps
     learn_start: Annotated[int, Field(ge=0, le=10**12)]  # transitions in the memory
     batch_size: Annotated[int, Field(ge=1, le=2**24)]  # transitions
     precision: Literal["auto", "fp32", "bf16"]
-    ema: Annotated[int, Field(ge=10, le=10**7)] | None = None  # updates averaged for an evaluation; null: the latest
-    weights: Annotated[str, Field(pattern=PINNED)] | None = None  # FOLDER@DIGEST of exported ones; null: random ones
+    ema: Annotated[int, Field(ge=10, le=10**7)] | None = None  # updates to average for an evaluation; null: latest
+    weights: Annotated[str, Field(pattern=PINNED)] | None = None  # FOLDER@DIGEST of exported weights; null: random
 
     @property
     def pinned(self) -> tuple[str, str] | None:
@@ -309,7 +308,7 @@ class TrainingConfig:
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class ReplayConfig:
-    """The replay memory's two bounds."""
+    """The two bounds of the replay memory."""
 
     capacity: Annotated[int, Field(ge=16, le=10**9)]  # observations
     max_bytes: Annotated[int, Field(ge=2**20, le=2**50)]  # bytes, everything included
@@ -320,18 +319,18 @@ class EvaluationConfig:
     """Episodes at a fixed epsilon, played without touching the training."""
 
     episodes: Episodes
-    interim_episodes: Episodes | None  # of an evaluation amid the training; null: as many as at its end
+    interim_episodes: Episodes | None  # of an evaluation during training; null: as many as at the end
     epsilon: Probability
-    every_episodes: Count | None  # training episodes between evaluations; null: none of them
-    every_steps: Count | None  # training steps between evaluations; null: none of them
+    every_episodes: Count | None  # training episodes between evaluations; null: none
+    every_steps: Count | None  # training steps between evaluations; null: none
     at_end: bool
     num_envs: Annotated[int, Field(ge=1, le=_MOST_GAMES)] | None  # episodes side by side; null: `at_once` chooses
     seed: Seed
-    video: Literal["first_minute", "best_minute", "all"] | bool  # of the best episode; true is its first minute
+    video: Literal["first_minute", "best_minute", "all"] | bool  # of the best episode; true: its first minute
 
     @property
     def at_once(self) -> int:
-        """Episodes played side by side: many, in rounds of one length that leave no emulator idle."""
+        """Episodes to play side by side: many, in equal rounds so that no emulator is idle."""
         return self.num_envs or math.ceil(self.episodes / math.ceil(self.episodes / _MOST_GAMES))
 
 
@@ -345,7 +344,7 @@ class TrackingConfig:
     every_steps: Count  # steps between two points of a curve
     histogram_episodes: Count  # episodes in a window's score histogram
     commit_episodes: Count  # episodes between two checkpoints
-    commit_seconds: Annotated[float, Field(gt=0, le=1e9)]  # seconds between two checkpoints at the most
+    commit_seconds: Annotated[float, Field(gt=0, le=1e9)]  # most seconds between two checkpoints
 
     def __post_init__(self) -> None:
         check_server("tracking.uri", self.uri)
@@ -356,7 +355,7 @@ class BudgetConfig:
     """Limits of this command, which do not change the experiment."""
 
     steps: Count | None
-    flops: Annotated[float, Field(gt=0)] | None = None  # of updates; no key of older runs and cards
+    flops: Annotated[float, Field(gt=0)] | None = None  # of updates; missing in older runs and cards
     wall_clock: str | Count | None  # a number alone is in seconds
     forecast: Literal["refuse", "warn", "off"]
 
@@ -365,7 +364,7 @@ class BudgetConfig:
 
     @property
     def limits(self) -> dict[str, float]:
-        """What ends a training, by key."""
+        """The limits that end a training, by key."""
         limits = {"budget.steps": self.steps, "budget.flops": self.flops}
         return {key: limit for key, limit in limits.items() if limit is not None}
 
@@ -376,7 +375,7 @@ class BudgetConfig:
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class PathsConfig:
-    """Where everything that a command writes goes."""
+    """The folder that a command writes to."""
 
     outputs: Annotated[str, Field(min_length=1)]
 
@@ -386,19 +385,19 @@ class BaselineAgentConfig:
     """A player without a network."""
 
     name: Literal["random", "constant"]
-    action: Annotated[int, Field(ge=0, le=17)]  # of the constant player, by its place among the game's
+    action: Annotated[int, Field(ge=0, le=17)]  # of the constant player, by index
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class Config:
     """One training experiment."""
 
-    plugins: Plugins = field(default_factory=dict)  # that its components are of; first, since the others need it
+    plugins: Plugins = field(default_factory=dict)  # of its components; first, since the others need it
     seed: Seed
     resume: Literal["auto", "never", "must"]
     device: Device
     threads: Annotated[int, Field(ge=1, le=256)] | None
-    compile: bool = False  # as in runs and cards from before there was the key
+    compile: bool = False  # older runs and cards lack the key
     training: TrainingConfig
     replay: ReplayConfig
     env: Env
@@ -433,12 +432,12 @@ class Config:
                 f"training.batch_size={self.training.batch_size}: larger than replay.capacity={self.replay.capacity}; "
                 f"at most {self.replay.capacity}"
             )
-        # An environment's newest observation has no successor yet, and its oldest have no whole stack any more.
+        # An environment's newest observation has no successor yet, and its oldest no longer have a whole stack.
         most = self.replay.capacity - self.env.num_envs * (self.env.stack + 1)
         if self.training.learn_start >= most:
             raise ConfigError(
-                f"training.learn_start={self.training.learn_start}: nothing would be learned, since the memory of "
-                f"replay.capacity={self.replay.capacity} holds no more transitions; need less than {most}"
+                f"training.learn_start={self.training.learn_start}: should be less than {most}, the transitions that "
+                f"replay.capacity={self.replay.capacity} holds; else nothing would be learned"
             )
         frame = self.env.size**2
         least = _INDEX_BYTES * self.replay.capacity + 9 * (frame + frame // 255 + 16)  # LZ4's bound for noise
@@ -460,7 +459,7 @@ class Config:
                     f"phase.{name}.sampler={phase.sampler}: no such sampler; {nearest(phase.sampler, self.samplers)}"
                 )
         if len({phase.steps is None for phase in self.phase.values()}) > 1:
-            raise ConfigError("phase: all phases must have their length in the same unit, episodes or steps")
+            raise ConfigError("phase: set episodes in all phases, or steps in all")
 
     @property
     def game(self) -> Component | None:
@@ -479,10 +478,10 @@ class Config:
         for key in (FREE - {"plugins"}) | {"samplers", "sampler"}:
             del tree[key]
         del tree["env"]["workers"]
-        tree["evaluation"]["video"] = bool(tree["evaluation"]["video"])  # whichever part is filmed
+        tree["evaluation"]["video"] = bool(tree["evaluation"]["video"])  # the filmed part does not matter
         if self.training.pinned is not None:
-            _, tree["training"]["weights"] = self.training.pinned  # wherever they lie
-        # Keys at their defaults are left out: a run from before there was the key stays itself.
+            _, tree["training"]["weights"] = self.training.pinned  # their folder does not matter
+        # Newer keys are left out at their defaults, so that older runs keep their identity.
         for part, key, default in (
             *((tree["training"], "ema", None), (tree["training"], "weights", None)),
             *((tree["objective"], "reward_exponent", 1), (tree, "plugins", {})),
@@ -494,7 +493,7 @@ class Config:
         return tree
 
     def identity(self) -> str:
-        """Return ten hexadecimal digits that are equal exactly for runs with the same `science`."""
+        """Return ten hexadecimal digits of the hash of `science`."""
         return digest(self.science())
 
     def run_name(self) -> str:

@@ -1,6 +1,6 @@
 """The JSON documents that verbs print with `format=json`; docs/json.md has their schema.
 
-A field that is added leaves the version as it is; one that goes, or means something else, makes it one more.
+A new field keeps the version; removing a field or changing its meaning increments it.
 """
 
 from math import isfinite
@@ -11,24 +11,24 @@ from pydantic import BaseModel, BeforeValidator, Field, TypeAdapter
 Number = Annotated[
     float | None, BeforeValidator(lambda value: value if isinstance(value, int) or isfinite(value or 0) else None)
 ]
-"""A number, null where there is none."""
+"""A number; null if there is none."""
 Said = Literal["better", "worse", "equivalent", "not decided"]
 
 
 class Document(BaseModel):
-    """What all documents have."""
+    """The fields of all documents."""
 
     version: Literal[1] = 1
 
 
 class Question(BaseModel):
-    """What was asked."""
+    """The question that the groups answer."""
 
-    by: list[str] = Field(description="keys that tell groups apart; of a table of scores, group")
+    by: list[str] = Field(description="keys that tell groups apart; `group` for a table of scores")
     score: Literal["last", "training", "file"]
-    window: float | None = Field(description="share of the steps that score=training is about")
-    measure: str = Field(description="what a seed's score is, in words")
-    seeds: int = Field(description="a group, at the last look")
+    window: float | None = Field(description="share of the steps, the last ones, that score=training covers")
+    measure: str = Field(description="definition of a seed's score")
+    seeds: int = Field(description="per group, at the last look")
     error: float = Field(description="probability of any false verdict")
     delta: float | None
     relative: bool = Field(description="whether delta is a share of a score")
@@ -36,7 +36,7 @@ class Question(BaseModel):
 
 
 class GroupScore(BaseModel):
-    """A group's score, or that of a key's value."""
+    """The score of a group, or of one value of a key."""
 
     family: str = Field(description="the key, or all keys that differ")
     group: str
@@ -47,25 +47,25 @@ class GroupScore(BaseModel):
 
 
 class PairVerdict(BaseModel):
-    """What is known of one group's mean less another's."""
+    """The verdict on the difference between the means of two groups."""
 
     family: str
     group: str
     other: str
-    said: Said = Field(description="of the group, against the other")
+    said: Said = Field(description="verdict on the group, against the other")
     difference: Number
     low: Number = Field(description="the interval that the verdict rests on")
     high: Number
-    seeds: int = Field(description="of each group at that look; 0 before the first")
+    seeds: int = Field(description="per group at that look; 0 before the first")
 
 
 class Looks(BaseModel):
-    """The plan of a family, and where it stands."""
+    """The looks of a family, planned and taken."""
 
     family: str
-    planned: list[int] = Field(description="seeds a group")
+    planned: list[int] = Field(description="seeds per group")
     taken: list[int]
-    next: int | None = Field(description="null after the last, or where all is decided")
+    next: int | None = Field(description="null after the last look, or once all is decided")
     error: float
     spent: float
 
@@ -75,7 +75,7 @@ class Compared(Document):
 
     verb: Literal["compare", "decide"]
     question: Question
-    decided: bool = Field(description="whether no pair is left undecided; false where nothing is compared")
+    decided: bool = Field(description="whether all pairs are decided; false if nothing is compared")
     verdict: str
     others: list[str] = Field(description="the answers by the other keys")
     caveats: list[str]
@@ -91,7 +91,7 @@ class Reported(BaseModel):
     run: str
     state: str
     steps: int = Field(description="of training; of an unfinished run, at its last evaluation")
-    evaluated_at: int | None = Field(description="step of the evaluation; null where there is none")
+    evaluated_at: int | None = Field(description="step of the evaluation; null without one")
     evaluation: dict[str, float] = Field(description="its metrics, as in MLflow")
 
 
@@ -106,21 +106,21 @@ class Query(Document):
     """The answer of `query`."""
 
     verb: Literal["query"] = "query"
-    environment: dict[str, Any] = Field(description="what Gymnasium says")
+    environment: dict[str, Any] = Field(description="Gymnasium's description")
     config: dict[str, Any] = Field(description="the keys under env")
 
 
 class Trial(BaseModel):
-    """A contract that was tried."""
+    """A contract that was tested."""
 
     component: str
     contract: str
     kept: bool
-    because: str = Field(description="why it is broken, else empty")
+    because: str = Field(description="why it is broken; empty if it is kept")
 
 
 class Cost(BaseModel):
-    """What a training costs on this machine."""
+    """The cost of a training on this machine."""
 
     component: str
     pixels: int
@@ -135,7 +135,7 @@ class Check(Document):
 
     verb: Literal["check"] = "check"
     trials: list[Trial]
-    costs: list[Cost] = Field(description="empty where a contract is broken")
+    costs: list[Cost] = Field(description="empty if a contract is broken")
 
 
 AnyDocument: TypeAdapter[Compared | Report | Query | Check] = TypeAdapter(

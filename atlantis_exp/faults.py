@@ -12,7 +12,7 @@ class Fault(RuntimeError):
 
 
 class RunFault(Fault):
-    """Ended a run at its last commit, from where the same command continues it."""
+    """Ended a run at its last commit, where the same command continues it."""
 
 
 class ConfigError(Fault, ValueError):
@@ -23,7 +23,7 @@ class ConfigError(Fault, ValueError):
 
 
 def in_words(error: OSError) -> str:
-    """Return an error of a file or folder and its remedy."""
+    """Return a file's error with its remedy."""
     place = f"{error.filename}: " if error.filename else ""
     remedy = ""
     if error.errno in (ENOSPC, EDQUOT, EFBIG):

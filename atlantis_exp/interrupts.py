@@ -1,4 +1,4 @@
-"""Ctrl-C from the first moment on, also where a library swallows a KeyboardInterrupt or aborts at it."""
+"""Handle Ctrl-C from the first moment, even if a library swallows KeyboardInterrupt or aborts on it."""
 
 import os
 import signal
@@ -10,7 +10,7 @@ _seen = False
 
 
 def listen() -> None:
-    """End the process at a SIGINT, as long as there is nothing to lose; one that was started to ignore it does."""
+    """Exit on SIGINT while there is nothing to lose, unless the process was started to ignore it."""
     global _seen
     _seen = False
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
@@ -18,7 +18,7 @@ def listen() -> None:
 
 
 def hold() -> None:
-    """Note a SIGINT and raise KeyboardInterrupt from now on: work begins."""
+    """Record SIGINT and raise KeyboardInterrupt from now on, since work begins."""
     if signal.getsignal(signal.SIGINT) is _leave:
         signal.signal(signal.SIGINT, _note)
         sys.unraisablehook = _quiet
@@ -30,7 +30,7 @@ def seen() -> bool:
 
 
 def _leave(_: int, __: FrameType | None) -> NoReturn:
-    # Raising here would run through imports: pydantic swallows it, torch's abort the process.
+    # An exception would run through imports: pydantic swallows it, torch aborts the process.
     show_cursor = "\x1b[?25h" if sys.stdout.isatty() else ""
     os.write(2, f"{show_cursor}atlantis_exp: interrupted\n".encode())
     os._exit(128 + signal.SIGINT)
@@ -43,6 +43,6 @@ def _note(_: int, __: FrameType | None) -> NoReturn:
 
 
 def _quiet(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Print what Python cannot raise, except a KeyboardInterrupt: it is noted."""
+    """Print an exception that Python cannot raise, unless it is the KeyboardInterrupt that `_note` recorded."""
     if unraisable.exc_type is not KeyboardInterrupt:
         sys.__unraisablehook__(unraisable)

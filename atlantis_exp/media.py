@@ -1,4 +1,4 @@
-"""Draw pictures and films, as bytes; heavy libraries are imported on use."""
+"""Draw pictures and films as bytes; import heavy libraries on use."""
 
 import io
 import tempfile
@@ -23,10 +23,10 @@ PURPLE, SKY = "#CC79A7", "#56B4E9"
 
 
 def score_histogram(scores: Sequence[float], title: str, axis: tuple[float, float]) -> bytes:
-    """Return a PNG, 256 x 256, of a score distribution; scores beyond the axis stand at its ends.
+    """Return a 256 x 256 PNG of a score distribution; scores beyond the axis are clipped to it.
 
-    axis: its two ends, the same for all pictures of a game; logarithmic if it begins above 0. Shares have a square root
-        scale, on which both broad and narrow distributions are legible.
+    axis: both ends, the same for all pictures of a game; logarithmic if it begins above 0. Shares have a square root
+        scale, which shows broad and narrow distributions.
     """
     figure, axes = _square()
     axes.hist(np.clip(scores, *axis), _edges(axis).tolist(), weights=np.full(len(scores), 1 / len(scores)), color=BLUE)
@@ -44,7 +44,7 @@ def score_histogram(scores: Sequence[float], title: str, axis: tuple[float, floa
 def score_heatmap(
     ends: Sequence[int], scores: Sequence[float], length: int, unit: str, axis: tuple[float, float]
 ) -> bytes:
-    """Return a PNG, 256 x 256, of the score distribution over the training, each column's fullest bin the darkest.
+    """Return a 256 x 256 PNG of the score distribution over the training; each column's fullest bin is darkest.
 
     ends: of each episode, in the unit of the training's length; scores: of the same episodes.
     axis: as in `score_histogram`.
@@ -75,12 +75,12 @@ def scene(
 ) -> npt.NDArray[np.uint8]:
     """Return a picture of a film: the (210, 160, 3) screen, doubled, and the decision to its right.
 
-    An action's bar is empty for the least value and full for the highest; without values there are no bars.
+    An action's bar is empty for the lowest value and full for the highest. Without values there are no bars.
     """
     import cv2
 
     picture = np.full((420, 560, 3), 24, np.uint8)
-    # Four bytes a pixel are repeated as one number, ten times as fast as three.
+    # Four bytes per pixel repeat as one number, ten times as fast as three.
     pixels = cv2.cvtColor(screen, cv2.COLOR_RGB2RGBA).view(np.uint32)[..., 0].repeat(2, axis=1).repeat(2, axis=0)
     cv2.cvtColor(pixels.view(np.uint8).reshape(420, 320, 4), cv2.COLOR_RGBA2RGB, dst=picture[:, :320])
 
@@ -120,11 +120,11 @@ def film(pictures: Iterable[npt.NDArray[np.uint8]], frames_per_second: float) ->
             rate = Fraction(frames_per_second).limit_denominator(1000)
             stream = container.add_stream("libx264", rate=rate, options={"crf": "28", "preset": "ultrafast"})
             stream.pix_fmt = "yuv420p"
-            stream.thread_count = 1  # pictures as small as these take a third longer on several
+            stream.thread_count = 1  # several threads take a third longer for pictures this small
             for picture in pictures:
                 if not stream.codec_context.is_open:
                     stream.height, stream.width = picture.shape[:2]
-                # Ten times as fast as the encoder's own conversion.
+                # Ten times as fast as the encoder's conversion.
                 yuv = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2YUV_I420), np.uint8)
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(yuv, format="yuv420p")))
             container.mux(stream.encode())
@@ -132,7 +132,7 @@ def film(pictures: Iterable[npt.NDArray[np.uint8]], frames_per_second: float) ->
 
 
 def run_colour(player: str, sampler: str | None = None) -> str:
-    """Return a run's colour as #rrggbb: the player's own, paler for other samplers than uniform."""
+    """Return a run's colour as #rrggbb: the player's own, paler for samplers other than uniform."""
     own = {"cnn": BLUE, "resnet": VERMILLION, "random": GREY, "constant": BLACK}
     rest = (GREEN, ORANGE, PURPLE, SKY)
     colour = _rgb(own.get(player) or rest[zlib.crc32(player.encode()) % len(rest)])

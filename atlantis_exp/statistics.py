@@ -51,7 +51,7 @@ def human_normalised(score: float, random: float, human: float) -> float:
 def interquartile_mean(scores: Scores) -> float:
     """Return the mean without the floor(n / 4) lowest and highest scores: rliable's IQM."""
     low, high = len(scores) // 4, len(scores) - len(scores) // 4
-    # As scipy's trim_mean to the last bit, which costs a second to import.
+    # Equals scipy's trim_mean to the last bit; importing scipy costs a second.
     return float(np.partition(np.asarray(scores, np.float64), (low, high - 1))[low:high].mean())
 
 

@@ -17,10 +17,10 @@ from rich.text import Text
 
 _HERE = Path(__file__).parent
 PROGRAM = "atlantis-exp" if (_HERE / "conf").is_dir() else "python -m atlantis_exp"
-"""The command to type: the script of an installed wheel, which has the config groups, or the module of a checkout."""
+"""The command to type: an installed wheel has a script and the config groups, a checkout the module."""
 LINE_SECONDS = 4.0  # before the first line about work in progress
-_documents: list[str] | None = None  # to be printed, while nothing else may be
-_FIRST_SECONDS = 1.0  # shorter work needs no line
+_documents: list[str] | None = None  # collected by `only_documents`
+_FIRST_SECONDS = 1.0  # shorter work is not shown
 
 
 class _Harmless:
@@ -37,7 +37,7 @@ class _Harmless:
 
 
 class _Console(Console):
-    """A console that shows texts as they are: only its own control codes reach the terminal."""
+    """A console without markup; only its own control codes reach the terminal."""
 
     def __init__(self, **settings: Any) -> None:
         file = sys.stdout.stream if isinstance(sys.stdout, _Harmless) else sys.stdout
@@ -48,7 +48,7 @@ class _Console(Console):
 
 
 def guard() -> None:
-    """Make stdout and stderr drop control characters, and write in any encoding."""
+    """Make stdout and stderr drop control characters and work in any encoding."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if not isinstance(stream, _Harmless):
@@ -58,14 +58,14 @@ def guard() -> None:
 
 
 def console(least: int | None = None) -> Console:
-    """Return a console of at least `least` columns, for a table; None keeps lines whole."""
+    """Return a console of at least `least` columns, for a table; None does not wrap lines."""
     if least is None:
         return _Console(soft_wrap=True)
     return _Console(width=max(shutil.get_terminal_size().columns, least))
 
 
 def harmless(text: str) -> str:
-    """Return a text without control characters but newlines."""
+    """Return a text without control characters other than newlines."""
     return "".join(character for character in text if character == "\n" or character.isprintable())
 
 
@@ -76,7 +76,7 @@ def warn(text: str) -> None:
 
 @contextmanager
 def only_documents() -> Iterator[None]:
-    """Send to stderr all that this process and those it starts print, except documents."""
+    """Redirect to stderr all output of this process and its children, except documents."""
     global _documents
     sys.stdout.flush()
     kept, _documents = os.dup(1), []
@@ -93,7 +93,7 @@ def only_documents() -> Iterator[None]:
 
 
 def document(text: str) -> None:
-    """Have a verb's answer printed, one line of JSON, where documents are asked for."""
+    """Print a verb's answer, one line of JSON, when `only_documents` ends; without it print nothing."""
     if _documents is not None:
         _documents.append(text)
 
@@ -107,7 +107,7 @@ def until_line(lines: int) -> float:
 def working(what: str, how_far: Callable[[], str] = str) -> Iterator[None]:
     """Show work in progress: a changing line on a terminal, a line every few seconds elsewhere.
 
-    how_far: asked for each line, in another thread.
+    how_far: called for each line, in another thread.
     """
     shown, began, ended = console(), time.monotonic(), threading.Event()
 

@@ -75,7 +75,7 @@ def test_a_mistake_leaves_stdout_empty(command: Command, capfd: pytest.CaptureFi
     assert command("compare", f"paths.outputs={tmp_path}", "format=json") == 2
     shown = capfd.readouterr()
     assert shown.out == ""
-    assert shown.err.startswith("atlantis_exp: there is no finished training")
+    assert shown.err.startswith("atlantis_exp: no finished training")
 
 
 def test_only_documents_reach_stdout_also_from_other_processes_and_where_the_work_fails(

@@ -148,8 +148,8 @@ class Mine:
         (GAME.format(name="breakut"), "breakut: ALE has no ROM of that name"),
         (GAME.format(name="pong"), "should be ALE's, ('NOOP', 'FIRE', 'RIGHT', 'LEFT', 'RIGHTFIRE', 'LEFTFIRE')"),
         (GAME.format(name="pooyan"), "pooyan: its screen is (220, 160) pixels; only (210, 160) can be played"),
-        (GAME.format(name="atlantis"), "env=atlantis is built in and is not replaced"),
-        (GAME.format(name="atlantis_v5"), "env=atlantis_v5 is one of our presets and is not replaced"),
+        (GAME.format(name="atlantis"), "env=atlantis is built in and cannot be replaced"),
+        (GAME.format(name="atlantis_v5"), "env=atlantis_v5 is a preset and cannot be replaced"),
         (re.sub("    actions.*\n", "", GAME.format(name="pong")), "actions: missing; write actions = "),
         (re.sub("    score_r.*\n", "", GAME.format(name="pong")), "score_range: missing; write score_range = "),
         (GAME.format(name="pong").replace("(0.0, 100.0)", "[0.0, 1.0]"), "score_range: "),
@@ -166,7 +166,7 @@ class Mine:
                 "    def points(self, reward, ram): ...\n",
             )
         ),
-        (GAME.format(name="pong") + "    def __init__(self, speed: int = 1): ...\n", "speed: a game has no settings"),
+        (GAME.format(name="pong") + "    def __init__(self, speed: int = 1): ...\n", "speed: a game takes no settings"),
     ],
 )
 def test_a_game_that_is_none_is_one_line(source: str, reason: str, said: Callable[..., str], tmp_path: Path) -> None:
@@ -191,7 +191,7 @@ def test_a_run_of_another_game_is_one_by_its_id_and_its_plugin(tiny: Compose) ->
             parse(Config, {**stored, "env": {**stored["env"], "id": id_}})
     with pytest.raises(ConfigError, match="did you mean 'ALE/Atlantis-v5'"):
         parse(Config, {**stored, "plugins": {}})
-    with pytest.raises(ConfigError, match="its game is a plugin's"):
+    with pytest.raises(ConfigError, match="its game comes from a plugin"):
         make_emulator(parse(EnvConfig, stored["env"]))
 
 

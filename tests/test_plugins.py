@@ -253,7 +253,7 @@ def test_a_run_is_evaluated_exported_played_and_compared(
     )
     capsys.readouterr()
     assert command(*own, "model=mynet", "seed=1") == 0
-    assert re.search(rf"mynet, sha {sha} of run {names[1]} has become mynet, sha", capsys.readouterr().out)
+    assert re.search(rf"run {names[1]} used mynet, sha {sha}, this one uses mynet, sha", capsys.readouterr().out)
     assert len([*(plugins / "outputs" / "runs").iterdir()]) == 3
 
 
@@ -416,14 +416,14 @@ BROKEN = [  # what is in mynet.py instead of a part of it, the line that is to b
         "self.head((x",
         "((x",
         "@component",
-        r"TypeError: MyNet returns \(2, 200\) for two states; it should be \(2, 4\)",
+        r"TypeError: MyNet returns \(2, 200\) for two states; should be \(2, 4\)",
     ),
-    ("num_actions, head, *,", "*,", "@component", r"TypeError: __init__ takes 1 arguments; it is given 3"),
+    ("num_actions, head, *,", "*,", "@component", r"TypeError: __init__ takes 1 arguments but gets 3"),
     (
         "width: Width",
         "width: torch.Tensor",
         "@component",
-        r"TypeError: width: .*Tensor is not a type of a setting; use",
+        r"TypeError: width: .*Tensor cannot be a setting's type; use",
     ),
     ("width: Width", "width: np.ndarray", "def __init__", r"NameError: name 'np' is not defined"),
     ("width: Width", "width: 'a side of'", "@component", r"SyntaxError: "),
@@ -442,11 +442,11 @@ BROKEN = [  # what is in mynet.py instead of a part of it, the line that is to b
     ),
     ('"mynet", "model"', '"mynet"', "@component", r"ValueError: '': no such kind"),
     ('"mynet", "model"', '"MyNet", "model"', "@component", r"ValueError: 'MyNet': a name has lowercase letters"),
-    ('"mynet", "model"', '"cnn", "model"', "@component", r"model=cnn is built in and is not replaced"),
+    ('"mynet", "model"', '"cnn", "model"', "@component", r"model=cnn is built in and cannot be replaced"),
     ("smallest_side = 8", "smallest_side = 8.5", "@component", r"TypeError: smallest_side: should be a int, not 8\.5"),
     ("def forward(self, x)", "def forward(self)", "@component", r"TypeError: needs a method forward\(self, x\)"),
     ("import torch\n", "import torch\nraise SystemExit(3)\n", "raise System", r"SystemExit: 3"),
-    ('@component("mynet", "model")\n', "", "", r"names no component; put @component"),
+    ('@component("mynet", "model")\n', "", "", r"has no component; put @component"),
 ]
 
 
@@ -479,7 +479,7 @@ def test_a_head_of_quantiles_needs_their_number(plugins: Path, said: Said) -> No
     [
         ("plugins=./none.py", "/.*/none.py is not a file"),
         ("plugins=./other/mynet.py,mynet.py", r"mynet\.py: /.*/other/mynet\.py is called mynet, too; rename one"),
-        ("plugins=copy.py,mynet.py", r"/mynet.py:13: model=mynet is /.*/copy\.py's, too"),
+        ("plugins=copy.py,mynet.py", r"/mynet.py:13: model=mynet is also in /.*/copy\.py"),
         ("plugins=./my-net.py", r"write a file NAME\.py"),
         ("plugins=nothing", "no such distribution is installed"),
         ("plugins=3", "write files and distributions"),
@@ -512,7 +512,7 @@ def test_options_of_one_s_own_come_from_a_folder_and_name_no_code(
     assert "'mine'" in said("--config-dir=own", "experiment=mne")
     experiment = (own / "experiment" / "mine.yaml").read_text()
     for text, reason in {
-        "plugins: [./mynet.py]": "names plugins; only the command line may",
+        "plugins: [./mynet.py]": "names plugins; name them on the command line",
         "optimizer: {_target_: os.system}": r"optimizer\._target_: no such key",
     }.items():
         (own / "experiment" / "mine.yaml").write_text(experiment.replace("optimizer: {lr: 0.5}", text))
@@ -530,10 +530,10 @@ def test_options_of_one_s_own_come_from_a_folder_and_name_no_code(
     assert Path.cwd() == plugins
     assert os.environ.get("PYTHONPATH") != "own"
     (own / "model" / "cnn.yaml").write_text("name: cnn\n")
-    assert "/own/model/cnn.yaml: model=cnn is ours and is not replaced" in said("--config-dir=own", "seed=1")
+    assert "/own/model/cnn.yaml: model=cnn is built in; rename yours" in said("--config-dir=own", "seed=1")
     (own / "model" / "cnn.yaml").unlink()
     (own / "hydra").mkdir()
-    assert "its group hydra/ would name code" in said("--config-dir=own", "seed=1")
+    assert "its group hydra/ could name code" in said("--config-dir=own", "seed=1")
 
 
 def test_an_installed_plugin_that_cannot_be_read_is_not_called_missing(packaged: Path, said: Said) -> None:
@@ -610,7 +610,7 @@ def test_what_is_read_from_disk_names_no_code(
         "unrecorded": ({"model": network}, "model.name=evil: no such choice"),
         "module": ({**evil, "model": {**network, "name": "evil.MyNet"}}, "no such choice"),
         "path": ({**evil, "model": {**network, "name": "../evil"}}, "no such choice"),
-        "target": ({**evil, "model": {**network, "_target_": "evil.MyNet"}}, "has no settings of a component"),
+        "target": ({**evil, "model": {**network, "_target_": "evil.MyNet"}}, "not the settings of a component"),
         "file": ({"plugins": ["./evil.py"], "model": network}, "plugins"),
         "place": ({"plugins": {"./evil.py": evil["plugins"]["evil"]}, "model": network}, "plugins"),
         "head": (

@@ -183,7 +183,7 @@ def test_a_training_that_will_not_fit_is_refused_before_it_begins_unless_a_warni
     words = replaced(tiny_overrides, "evaluation.at_end=false", "budget.steps=20", f"paths.outputs={tmp_path}")
     assert command(*replaced(words, "budget.forecast=refuse")) == 1
     shown = capsys.readouterr()
-    assert re.fullmatch(rf"atlantis_exp: {shortage}.*; budget\.forecast=warn starts all the same\n", shown.err)
+    assert re.fullmatch(rf"atlantis_exp: {shortage}.*; budget\.forecast=warn starts anyway\n", shown.err)
     assert re.search(r"^expect about [\d,]+ steps/s, \d+ seconds for 20 steps, ", shown.out, re.MULTILINE)
     assert not list(tmp_path.glob("runs/*/checkpoints/*/manifest.json"))
     assert command(*replaced(words, "budget.forecast=warn")) == 0

@@ -1,7 +1,6 @@
-"""One module a verb: its schema, its overrides and one call.
+"""The verbs, one module each: schema, overrides and one call into `sessions`, which does the work.
 
-In: the words of a command line. Out: checked values for the floors below. Hydra, OmegaConf and the command line live
-here and nowhere else; the work of a verb lives in `sessions`.
+In: the words of a command line. Out: checked values. Only this package knows the command line, Hydra and OmegaConf.
 """
 
 import importlib
@@ -11,20 +10,20 @@ from pathlib import Path
 from atlantis_exp import interrupts
 
 VERBS = {
-    "train": "train one network; the same command again continues or reports it",
-    "decide": "train the seeds that a question needs until it is answered: model=cnn,resnet_fast",
-    "compare": "compare finished runs as groups: intervals, a verdict, a page of figures: by=model,sampler",
+    "train": "train a network; the same command continues it or prints its result",
+    "decide": "train seeds until a question is answered: model=cnn,resnet_fast",
+    "compare": "compare groups of finished runs: intervals, a verdict, a page of figures: by=model,sampler",
     "evaluate": "play a stored run's network again: run=NAME epsilon=0.05; an exported one: weights=FOLDER",
     "report": "print the results in the outputs folder as a table",
     "ui": "serve the MLflow UI on the local store",
-    "search": "find the best values of any keys, by Optuna: trials=20 optimizer=adam,rmsprop",
-    "export": "write a stored run's network as a folder to hand on: weights, card, scores: run=NAME to=pretrained/NAME",
+    "search": "find the best values of any keys with Optuna: trials=20 optimizer=adam,rmsprop",
+    "export": "export a stored run's network to share it: weights, card, scores: run=NAME to=pretrained/NAME",
     "baseline": "play without a network, as a tracked run: agent=random, agent=constant",
     "play": "play yourself at the keyboard, as a tracked run: player=NAME",
-    "query": "describe the environment, and its use by this config",
-    "check": "try a component's contracts and measure its cost: model=mynet plugins=./mynet.py",
-    "new": "write a package with a component of your own to begin with: model=mynet to=FOLDER",
-    "sync": "publish run folders to an MLflow store; to=URI to a server, every=30s until interrupted",
+    "query": "describe the environment and how this config uses it",
+    "check": "test a component's contracts and measure its cost: model=mynet plugins=./mynet.py",
+    "new": "write a package with a component to start from: model=mynet to=FOLDER",
+    "sync": "publish run folders to MLflow, to a server with to=URI, again and again with every=30s",
 }
 """The verbs and their purposes, as `--help` lists them: daily ones first."""
 DAILY = 6
@@ -54,7 +53,7 @@ def main() -> None:
 
 
 def _split(words: list[str]) -> tuple[str, list[str]]:
-    """Return the verb of a command line and its arguments; print help and the like, and end the process."""
+    """Return a command line's verb and its arguments; or print help, completions or the version, and exit."""
     from atlantis_exp import terminal
 
     terminal.guard()

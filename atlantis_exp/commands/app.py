@@ -1,4 +1,4 @@
-"""A verb: check its arguments before anything is written, then make the one call that does the work."""
+"""Run a verb: check its arguments before anything is written, then make the one call that does the work."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -20,17 +20,17 @@ T_co = TypeVar("T_co", covariant=True)
 
 @dataclass(frozen=True)
 class Asked(Generic[T_co]):
-    """A checked config, and the words that were typed for it."""
+    """A checked config, and the words typed for it."""
 
     config: T_co
     verb: str
-    overrides: tuple[str, ...]  # of this job alone, where it is one of a sweep
+    overrides: tuple[str, ...]  # of this job only, if it is one of a sweep
     typed: tuple[str, ...] = ()  # all arguments, before they became overrides
     machine: Machine = field(default_factory=here)
 
     @property
     def command(self) -> str:
-        """The command that repeats it."""
+        """The command that repeats the job."""
         return command_line(self.verb, *self.overrides)
 
 
@@ -41,12 +41,12 @@ class Verb(Generic[T]):
     name: str
     schema: type[T]
     work: Callable[[Asked[T]], Callable[[], object]]
-    """Imports the session's module and returns the call that does the work; an int from this is a late signal."""
+    """Imports the session's module and returns the call that does the work. An int from that call is a late signal."""
     config_name: str = ""  # of the file under conf/; by default the verb's name
     rewrite: Callable[[list[str]], list[str]] = list
     """Turns arguments as people write them into Hydra's overrides. Raises: ConfigError."""
     sweep: Callable[[Sequence[Asked[T]], Launcher, Sequence[str]], None] | None = None
-    """Does the jobs of a sweep by a launcher, given the arguments; None: one after the other."""
+    """Does a sweep's jobs with a launcher, given the arguments; None: one after the other."""
 
     def run(self, arguments: list[str]) -> None:
         """Check the config that the arguments make, and do the work.
@@ -70,7 +70,7 @@ class Verb(Generic[T]):
                 elif self.sweep is not None:
                     self.sweep(asked, launcher(arguments), arguments)
                 elif not launcher(arguments).is_basic:
-                    raise ConfigError(f"hydra/launcher: launches trainings, not {self.name}; leave it out")
+                    raise ConfigError(f"hydra/launcher: only trainings can be launched, not {self.name}; drop it")
                 else:
                     in_turn(lambda each: self.work(each)(), asked)
         except Fault as error:

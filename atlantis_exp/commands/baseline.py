@@ -1,4 +1,4 @@
-"""`python -m atlantis_exp baseline`: a player without a network as a tracked run (report figures 1.4 and 1.5)."""
+"""`python -m atlantis_exp baseline`: track a player without a network (report figures 1.4 and 1.5)."""
 
 from collections.abc import Callable
 from dataclasses import field
@@ -25,7 +25,7 @@ from atlantis_exp.faults import ConfigError
 class BaselineConfig:
     """A tracked run of a player without a network."""
 
-    plugins: Plugins = field(default_factory=dict)  # that its game is of; first, since the game needs it
+    plugins: Plugins = field(default_factory=dict)  # of its game; first, since the game needs it
     agent: BaselineAgentConfig
     env: Env
     evaluation: EvaluationConfig
@@ -39,7 +39,7 @@ class BaselineConfig:
             raise ConfigError(f"agent.action={self.agent.action}: {self.env.title} has no such action (valid: {named})")
 
     def identity(self) -> str:
-        """Return ten hexadecimal digits that are equal exactly for baselines with the same numbers."""
+        """Return ten hexadecimal digits of the hash of all keys that change a baseline's numbers."""
         env = to_dict(self.env)
         del env["workers"]
         plugins = {"plugins": {name: to_dict(each) for name, each in self.plugins.items()}} if self.plugins else {}
@@ -51,7 +51,7 @@ class BaselineConfig:
         return f"{self.agent.name}{action}-{self.env.id.rsplit('/')[-1]}-{self.identity()}"
 
     def title(self) -> str:
-        """Return the name that people read."""
+        """Return the name for people."""
         action = f" {self.agent.action}" if self.agent.name == "constant" else ""
         return f"{self.agent.name}{action} {self.env.id.rsplit('/')[-1]} {self.identity()[:6]}"
 

@@ -20,7 +20,7 @@ _SMALL = (  # a training of seconds
     *("training.precision=fp32", "threads=1", "evaluation.at_end=false", "evaluation.every_episodes=null"),
     *("evaluation.every_steps=null", "tracking=none", "tracking.commit_episodes=2"),
 )
-_OURS = (  # that others of their kinds are compared with
+_OURS = (  # built-in ones, to compare costs with
     *("model=cnn", "model=resnet", "sampler=uniform", "objective=dqn"),
     *("epsilon=exponential", "lr_schedule=constant", "env=atlantis_standard"),
 )
@@ -28,7 +28,7 @@ _OURS = (  # that others of their kinds are compared with
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class CheckConfig(Config):
-    """A training, whose components are tried."""
+    """A training whose components are tested."""
 
     format: Format
 
@@ -46,7 +46,7 @@ def _work(asked: Asked[Config]) -> Callable[[], None]:
         if kind in kinds:
             prefix = "env=" if kind == "env" else kind  # settings of a game's protocol go with any game
             own = [each for each in overrides if not each.startswith(prefix)]
-            with suppress(ConfigError):  # other settings may not go with it
+            with suppress(ConfigError):  # other settings may not fit it
                 ours = training_of([*own, text])
                 if all(ours.config.identity() != each.config.identity() for each in measured.values()):
                     measured[text] = ours

@@ -1,4 +1,4 @@
-"""`python -m atlantis_exp compare by=model,sampler`: which group of runs is better, by how much, how surely."""
+"""`python -m atlantis_exp compare by=model,sampler`: decide which group of runs is better."""
 
 import re
 from collections.abc import Callable, Iterable
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class CompareConfig:
-    """Finished runs as groups, and what tells them apart."""
+    """Groups of finished runs, and the question about them."""
 
     by: list[str]  # config keys
     runs: list[str]  # names, starts of names or patterns; none: all
@@ -44,15 +44,15 @@ class CompareConfig:
     def __post_init__(self) -> None:
         margin(self.delta)
         share("window", self.window)
-        of_runs = {"by": ["model"], "score": "last", "at_epsilon": None, "runs": [], "where": []}  # unless asked
+        of_runs = {"by": ["model"], "score": "last", "at_epsilon": None, "runs": [], "where": []}  # defaults
         for key, value in of_runs.items():
             if self.scores is not None and getattr(self, key) != value:
-                raise ConfigError(f"{key}: is of runs, not of scores={self.scores}, grouped by columns=group=NAME")
+                raise ConfigError(f"{key}: applies to runs, not to scores={self.scores}; use columns=group=NAME")
         named(self.columns)
 
     @property
     def question(self) -> "Question":
-        """What is asked of the groups."""
+        """The question about the groups."""
         from atlantis_exp.comparison.verdict import Question
 
         delta, relative = margin(self.delta)
@@ -61,7 +61,7 @@ class CompareConfig:
 
 
 def margin(delta: str | float | None) -> tuple[float | None, bool]:
-    """Return the difference that does not matter, and whether it is a share of a score. Raises: ConfigError."""
+    """Parse the difference that does not matter; return it and whether it is a share. Raises: ConfigError."""
     if delta is None:
         return None, False
     text = delta if isinstance(delta, str) else f"{delta:.15g}"
@@ -75,7 +75,7 @@ def margin(delta: str | float | None) -> tuple[float | None, bool]:
 
 
 def named(columns: Iterable[str]) -> dict[str, str]:
-    """Return the columns of a table of scores that have names of their own. Raises: ConfigError."""
+    """Parse the names of a table's columns for group, seed and score. Raises: ConfigError."""
     names = dict(text.partition("=")[::2] for text in columns)
     for key, name in names.items():
         if key not in ("group", "seed", "score") or not name:
@@ -84,18 +84,18 @@ def named(columns: Iterable[str]) -> dict[str, str]:
 
 
 def list_out(arguments: list[str]) -> list[str]:
-    """Let a list be written without brackets, as in `by=model,sampler`."""
-    # Hydra itself would take the commas for a sweep, and a second `=` for a mistake.
+    """Allow lists without brackets, as in `by=model,sampler`."""
+    # Hydra would read the commas as a sweep, and a second `=` as a mistake.
     return [re.sub(r"^(by|runs|where|columns)=([^\[].*)$", listed, argument) for argument in as_texts(arguments)]
 
 
 def as_texts(arguments: Iterable[str]) -> list[str]:
-    """Put the baseline in quotes: else Hydra refuses `lr=0.001` and reads a commit as a number."""
+    """Quote the baseline, since Hydra refuses `lr=0.001` and reads some commits as numbers."""
     return [re.sub(r"^baseline=(?!null$)([^'\"]+)$", r"baseline='\1'", argument) for argument in arguments]
 
 
 def listed(match: re.Match[str]) -> str:
-    """Return KEY=a,b of a match as KEY=['a','b']."""
+    """Rewrite a match of KEY=a,b as KEY=['a','b']."""
     items = (f"'{item}'" for item in re.split(r",(?![^\[]*\])", match[2].replace("'", "")))
     return f"{match[1]}=[{','.join(items)}]"
 

@@ -1,4 +1,4 @@
-"""Shell completion: verbs, groups, options, keys and run names, without loading anything heavy."""
+"""Complete verbs, groups, options, keys and run names for a shell, without loading anything heavy."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,7 +15,7 @@ _atlantis_exp() {
     local word=${words[-1]}
     IFS=$'\\n'
     COMPREPLY=($(atlantis-exp --complete "${words[@]:1}"))
-    [[ $word == *=* ]] && COMPREPLY=("${COMPREPLY[@]#"${word%%=*}="}")  # bash takes the rest for a word of its own
+    [[ $word == *=* ]] && COMPREPLY=("${COMPREPLY[@]#"${word%%=*}="}")  # to bash the value is a separate word
     compopt -o nospace
 }
 complete -F _atlantis_exp atlantis-exp""",
@@ -28,11 +28,11 @@ _atlantis_exp() {
 compdef _atlantis_exp atlantis-exp""",
     "fish": "complete -c atlantis-exp -f -a '(atlantis-exp --complete (commandline -opc)[2..] (commandline -ct))'",
 }
-"""What a shell evaluates, as in `eval "$(atlantis-exp --completion bash)"`."""
+"""The scripts that shells evaluate: `eval "$(atlantis-exp --completion bash)"`."""
 
 
 def complete(flag: str, words: Sequence[str]) -> str:
-    """Return what `--complete WORDS` prints, or the script of `--completion SHELL`."""
+    """Return the completions for `--complete WORDS`, or the script for `--completion SHELL`."""
     if flag == "--complete":
         return "\n".join(candidates(words))
     return SCRIPTS.get("".join(words), f"echo 'atlantis_exp: --completion: one of {', '.join(SCRIPTS)}' >&2")

@@ -1,4 +1,4 @@
-"""Compose the config groups into a checked config, by Hydra's compose API."""
+"""Compose the config groups into a checked config with Hydra's compose API."""
 
 import hashlib
 import re
@@ -24,7 +24,7 @@ from atlantis_exp.runs.files import ARTIFACT, read_file
 T = TypeVar("T")
 
 _LIKE = {"model": "cnn", "objective": "dqn", "env": "atlantis_standard"}
-"""For each kind whose components have keys besides their settings, a component of ours without settings."""
+"""The options without settings from which plugins take the other keys of their kind."""
 
 
 OmegaConf.register_new_resolver("outputs_folder", lambda: str(default_outputs()), replace=True)
@@ -61,13 +61,13 @@ def _folder(key: str, text: str) -> Path:
     folder = absolute(key, text)
     there = next(path for path in (folder, *folder.parents) if path.exists())
     if not there.is_dir() or folder == Path(folder.anchor):
-        what = "the root of all files" if there.is_dir() else f"{there} is not a folder"
+        what = "the root of the file system" if there.is_dir() else f"{there} is not a folder"
         raise ConfigError(f"{key}={text}: {what}; name a folder of its own, as in {key}=./outputs")
     return folder
 
 
 def pinned(weights: str) -> str:
-    """Return a folder of exported weights as FOLDER@DIGEST. Raises: ConfigError, also for another digest than typed."""
+    """Return a folder of exported weights as FOLDER@DIGEST. Raises: ConfigError, also if a typed digest is wrong."""
     folder, digits = weights.rpartition("@")[::2] if re.match(PINNED, weights) else (weights, "")
     path = Path(folder) / "weights.safetensors"
     try:
@@ -77,12 +77,12 @@ def pinned(weights: str) -> str:
         hint = nearest(folder, others)
         raise ConfigError(f"training.weights={folder}: not a folder of exported weights; {hint}") from None
     if digits not in ("", found):
-        raise ConfigError(f"training.weights={weights}: the weights there are @{found}")
+        raise ConfigError(f"training.weights={weights}: its weights are @{found}")
     return f"{folder}@{found}"
 
 
 def admit_plugins(plugins: Any) -> None:
-    """Admit the plugins that the key `plugins` holds, and make their components options. Raises: ConfigError."""
+    """Admit the plugins of the key `plugins`, and add their components to the groups. Raises: ConfigError."""
     references = [plugins] if isinstance(plugins, str) else plugins or []
     if isinstance(references, dict | DictConfig) or not all(isinstance(each, str) for each in references):
         raise ConfigError(f"plugins={plugins}: write files and distributions, as in plugins=[./mynet.py,mypackage]")
@@ -90,14 +90,14 @@ def admit_plugins(plugins: Any) -> None:
     for component in components.admitted().values():
         if (CONF / component.kind / f"{component.name}.yaml").is_file():
             raise ConfigError(
-                f"{component.path}:{component.line}: {component.kind}={component.name} is one of our presets "
-                "and is not replaced; give yours another name"
+                f"{component.path}:{component.line}: {component.kind}={component.name} is a preset "
+                "and cannot be replaced; rename yours"
             )
         ConfigStore.instance().store(name=component.name, group=component.kind, node=_option(component))
 
 
 def _option(component: components.Component) -> dict[str, Any]:
-    """Return a plugin component's config: its constructor's defaults, then its YAML."""
+    """Return a plugin component's config: its constructor's defaults, overridden by its YAML."""
     node: dict[str, Any] = {"defaults": [_LIKE[component.kind], "_self_"]} if component.kind in _LIKE else {}
     own = ("id", components.game_ids(component.name)[1]) if component.kind == "env" else ("name", component.name)
     node.update([own])
@@ -111,9 +111,9 @@ def _option(component: components.Component) -> dict[str, Any]:
         except (OSError, ValueError, RecursionError, YAMLError, OmegaConfBaseException) as error:
             raise ConfigError(f"{path}: {' '.join(str(error).split())}") from None
         if not isinstance(values, dict) or "defaults" in values:
-            raise ConfigError(f"{path}: should hold settings, KEY: VALUE a line, and no defaults list")
+            raise ConfigError(f"{path}: should hold one KEY: VALUE per line, and no defaults list")
         if values.setdefault(*own) != own[1]:
-            raise ConfigError(f"{path}: {own[0]} should be {own[1]}, as the file is called")
+            raise ConfigError(f"{path}: {own[0]} should be {own[1]}, like the file's name")
         node |= {str(key): value for key, value in values.items()}
     return node
 

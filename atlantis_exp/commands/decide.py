@@ -1,4 +1,4 @@
-"""`python -m atlantis_exp decide model=cnn,resnet_fast`: trains the seeds that the question needs, and answers it."""
+"""`python -m atlantis_exp decide model=cnn,resnet_fast`: train the seeds that a question needs, and answer it."""
 
 import dataclasses
 import re
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class DecideConfig(Config):
-    """A question about contenders, each a training of this config but for the keys that tell them apart."""
+    """A question about contenders: trainings of this config that differ in a few keys."""
 
     against: list[str]  # overrides: with all of them, or with none
     score: Literal["last", "training"]
@@ -69,7 +69,7 @@ def _launchers(texts: Iterable[str]) -> list[str]:
 
 
 def _first_contender(arguments: list[str]) -> list[str]:
-    """Take the first contender without the launcher: its config, which the others share, is composed and run here."""
+    """Return the arguments of the first contender, without a launcher: its config has the keys that all share."""
     flags = flags_of(arguments := _as_texts(arguments))
     if flags.multirun:
         raise ConfigError("-m: decide plans its own sweeps; drop -m")
@@ -79,7 +79,7 @@ def _first_contender(arguments: list[str]) -> list[str]:
         if override.key_or_group == "seed":
             raise ConfigError(f"{text}: decide trains seeds from 0 on, as many as it needs; drop it")
         if override.key_or_group == "resume" and override.value() != "auto":
-            raise ConfigError(f"{text}: decide goes on with the runs that are there; drop it")
+            raise ConfigError(f"{text}: decide continues the existing runs; drop it")
         if override.is_sweep_override() and not override.is_discrete_sweep():
             raise ConfigError(f"{text}: not a list of values; write them out, as in model=cnn,resnet_fast")
     dropped = _launchers(flags.overrides)
@@ -93,22 +93,22 @@ def _work(asked: Asked[DecideConfig]) -> Callable[[], None]:
 
 
 def contest_of(asked: Asked[DecideConfig]) -> "Contest":
-    """Return the question that was asked. Raises: ConfigError for one that cannot be decided."""
+    """Return the contest that was asked for. Raises: ConfigError if it cannot be decided."""
     from atlantis_exp.comparison.verdict import Question
     from atlantis_exp.sessions.deciding import Contest
 
     config, typed = asked.config, _as_texts(asked.typed)
     several = swept(typed)
     if several and config.against:
-        raise ConfigError(f"{several[0]}: several values, and against= as well; write one of the two")
+        raise ConfigError(f"{several[0]}: write several values or against=, not both")
     overrides = [read_override(text) for text in several or config.against]
     for override in overrides:
         key = override.key_or_group
         if key.split(".")[0] in _CLOSED:
-            raise ConfigError(f"{key}: says how contenders are trained or measured, not what they are; one value only")
+            raise ConfigError(f"{key}: all contenders are trained and measured alike; write one value")
         if key == "experiment":
             raise ConfigError(
-                "experiment: a preset is not a single key; name those that differ, as in objective=dqn,quantile"
+                "experiment: a preset sets many keys; name those that differ, as in objective=dqn,quantile"
             )
     contenders = [(), tuple(config.against)]
     if not config.against:
@@ -118,7 +118,7 @@ def contest_of(asked: Asked[DecideConfig]) -> "Contest":
         contenders = list(combined(choices))
     if len(contenders) < 2:
         raise ConfigError("nothing to decide between: give a key several values, as in model=cnn,resnet_fast")
-    texts = flags_of(typed).overrides  # as typed: Hydra has put values in the place of ${...}
+    texts = flags_of(typed).overrides  # as typed, before Hydra resolved ${...}
     launchers = _launchers(texts)
     shared = [text for text in texts if text not in (*several, *launchers)]
     fixed = [text for text in shared if text.lstrip("+~").split("=")[0].split(".")[0] not in _OWN]

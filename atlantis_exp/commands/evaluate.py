@@ -1,4 +1,4 @@
-"""`python -m atlantis_exp evaluate run=NAME epsilon=0.05`: a stored run's network, or an exported one, played."""
+"""`python -m atlantis_exp evaluate run=NAME epsilon=0.05`: play a stored run's network, or an exported one."""
 
 import re
 from collections.abc import Callable
@@ -28,12 +28,12 @@ class EvaluateConfig:
         is_folder = "/" in self.weights or Path(self.weights, "card.json").exists()
         if self.weights not in ("latest", "best") and not is_folder:
             hint = nearest(self.weights, ("latest", "best"))
-            raise ConfigError(f"weights={self.weights}: neither a run's nor a folder, as in pretrained/NAME; {hint}")
+            raise ConfigError(f"weights={self.weights}: not a folder such as pretrained/NAME; {hint}")
 
 
 def spell_out(arguments: list[str]) -> list[str]:
-    """Let `epsilon=` and `episodes=` on the command line be the evaluation's."""
-    # Hydra itself would take `epsilon` for the config group of that name.
+    """Expand `epsilon=` and `episodes=` to the evaluation's keys."""
+    # Hydra would read `epsilon` as the config group of that name.
     return [re.sub(r"^(epsilon|episodes)=", r"evaluation.\1=", argument) for argument in arguments]
 
 

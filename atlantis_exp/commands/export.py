@@ -1,4 +1,4 @@
-"""`python -m atlantis_exp export run=NAME to=pretrained/NAME`: a stored run's network as a folder to hand on."""
+"""`python -m atlantis_exp export run=NAME to=pretrained/NAME`: export a stored run's network to share it."""
 
 from collections.abc import Callable
 from functools import partial
@@ -14,7 +14,7 @@ from atlantis_exp.config import STRICT, Device, EvaluationConfig, PathsConfig
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class ExportConfig:
-    """A stored run's network as a folder to hand on."""
+    """An export of a stored run's network."""
 
     run: str
     weights: Literal["latest", "best"]

@@ -1,4 +1,4 @@
-"""`--help`: the verbs, and the keys of one with the sentences beside them in conf/; loads nothing heavy."""
+"""Print `--help`: the verbs, or a verb's keys with their comments in conf/; load nothing heavy."""
 
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -9,17 +9,17 @@ from atlantis_exp.terminal import PROGRAM
 
 _GROUP = re.compile(r" +- (?P<preset>override /)?(?P<group>[\w@.]+): (?P<option>\w+)\s*(?:#.*)?")
 _KEY = re.compile(r"(?P<indent> *)(?P<key>\w+):(?P<value>.*?)\s*(?:#(?P<comment>.*))?")
-_SHOWN = re.compile(r"  ([\w.]+)(?:=|\s|$)")  # a key as a help shows it
+_SHOWN = re.compile(r"  ([\w.]+)(?:=|\s|$)")  # a key in a line of help
 _DAILY = ("model", "experiment", "sampler", "env", "objective", "phase")  # groups shown first
-_VALUES = 30  # columns of a key and its value, behind which its sentence begins
+_VALUES = 30  # columns of a key and its value, before its comment
 
 _SWEEP = """\
   -m                 a sweep over the keys that have several values, as in seed=0,1,2
 """
 _FLAGS = """\
   --cfg job          print the config instead; --resolve fills in references to other keys
-  --config-dir DIR   further options of groups, in files of your own
-  --help             with GROUP=OPTION also the option's keys, with `all` every key"""
+  --config-dir DIR   add options of your own to groups
+  --help             add GROUP=OPTION for that option's keys, `all` for every key"""
 
 
 def overview() -> str:
@@ -38,7 +38,7 @@ def help_text(verb: str, arguments: Sequence[str]) -> str:
     preset = CONF / "experiment" / f"{named.get('experiment')}.yaml"
     chosen = dict(_groups(preset)) | named if preset.is_file() else named
     path = CONF / f"{'config' if verb == 'train' else verb}.yaml"
-    refused = ("seed", "resume") if verb == "decide" else ()  # it has the training's keys but sets these itself
+    refused = ("seed", "resume") if verb == "decide" else ()  # which it sets itself
     keys = [*_without(refused, _keys(path, ""))]
     own = {match[1] for line in keys if (match := _SHOWN.match(line))}
     short, full = [], []
@@ -78,7 +78,7 @@ def _of_group(name: str, option: str) -> Iterator[str]:
 
 
 def _without(taken: Collection[str], lines: Iterable[str]) -> Iterator[str]:
-    """Yield the lines of a group without the keys, and their sentences, that the verb's own file sets."""
+    """Yield lines of help without those of the `taken` keys, which another file sets."""
     is_taken = False
     for line in lines:
         if match := _SHOWN.match(line):
@@ -103,7 +103,7 @@ def _defaults(path: Path) -> list[str]:
 
 
 def _keys(path: Path, prefix: str) -> Iterator[str]:
-    """Yield a line for each key of a file: dotted key, value, sentence; then those of its base files."""
+    """Yield a line for each key of a file: dotted key, value, comment; then those of its base files."""
     own = [*_own_keys(path, prefix)]
     yield from own
     names = {match[1] for line in own if (match := _SHOWN.match(line))}
@@ -117,7 +117,7 @@ def _own_keys(path: Path, prefix: str) -> Iterator[str]:
     parents: list[str] = []
     in_defaults = False
     for line in path.read_text("utf-8").splitlines():
-        if re.match(r" +#", line) and not in_defaults:  # a sentence that goes on
+        if re.match(r" +#", line) and not in_defaults:  # a comment that continues
             yield f"  {'':{_VALUES}} {line.strip(' #')}"
         elif match := _KEY.fullmatch(line):
             depth = len(match["indent"]) // 2
@@ -131,7 +131,7 @@ def _own_keys(path: Path, prefix: str) -> Iterator[str]:
 
 
 def _plugins() -> Iterator[str]:
-    """Yield a paragraph of the installed distributions with components; import none."""
+    """Yield a paragraph that lists installed distributions with components; import none."""
     from atlantis_exp.components import installed
 
     if lines := [f"  plugins={name}: {', '.join(names)}" for name, names in installed().items()]:

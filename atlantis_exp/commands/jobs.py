@@ -1,4 +1,4 @@
-"""Make a `Job` of a training's command line: above all, the run's title."""
+"""Turn a training's command line into a `Job` with a title."""
 
 import json
 from collections.abc import Sequence
@@ -9,21 +9,21 @@ from atlantis_exp.commands.overrides import check, flags_of, read_override
 from atlantis_exp.config import FREE, Config
 from atlantis_exp.sessions.job import Job
 
-_SAID = ("model", "sampler", "seed")  # by a title anyway
+_TITLED = ("model", "sampler", "seed")  # in every title
 _BARE = ("experiment", "objective", "optimizer", "epsilon", "env")  # groups whose options speak for themselves
-_SPELLED = 4  # values at most; beyond them a few digits of their hash tell runs apart
+_SPELLED = 4  # changed values at most; more are shortened to a hash
 
 
 def job_of(asked: Asked[Config]) -> Job:
-    """Return the training that was asked for."""
+    """Return the training that a checked config asks for."""
     return Job(asked.config, words_of(asked.overrides), asked.overrides, asked.machine)
 
 
 def words_of(overrides: Sequence[str]) -> tuple[str, ...]:
     """Return a title's words besides network, sampler and seed: chosen options, then changed values.
 
-    `experiment=fast objective.n_step=3` gives `fast n_step=3`. Keys are as short as they are unique, and values are
-    normalised: Hydra writes 1_000 as 1000 for a job of a sweep.
+    `experiment=fast objective.n_step=3` gives `fast n_step=3`. Keys are shortened as far as they stay unique. Values
+    are normalised, since Hydra writes 1_000 as 1000 for a job of a sweep.
     """
     options: dict[str, str] = {}
     values: dict[str, str] = {}
@@ -32,7 +32,7 @@ def words_of(overrides: Sequence[str]) -> tuple[str, ...]:
         key, value = override.get_key_element().lstrip("+"), override.value()
         word = "" if override.is_delete() else value if isinstance(value, str) else json.dumps(value)
         root = key.lstrip("~").split(".")[0]
-        if key in _SAID or root in FREE or key in ("env.workers",) or word == "none":
+        if key in _TITLED or root in FREE or key in ("env.workers",) or word == "none":
             continue
         if key in _BARE:
             options[key] = word
@@ -48,6 +48,6 @@ def words_of(overrides: Sequence[str]) -> tuple[str, ...]:
 
 
 def training_of(overrides: Sequence[str]) -> Job:
-    """Return the training of some overrides. Raises: ConfigError."""
+    """Return the training that overrides ask for. Raises: ConfigError."""
     ((texts, config),) = check("config", Config, overrides).items()
     return job_of(Asked(config, "train", texts))

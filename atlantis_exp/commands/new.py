@@ -1,4 +1,4 @@
-"""`python -m atlantis_exp new model=mynet to=FOLDER`: a package with a component to start from."""
+"""`python -m atlantis_exp new model=mynet to=FOLDER`: write a package with a component to start from."""
 
 import keyword
 import re
@@ -34,21 +34,21 @@ class NewConfig:
                     f"{kind}={name}: a name has lowercase letters, digits and underscores, as in {kind}=mynet"
                 )
             if keyword.iskeyword(name):
-                raise ConfigError(f"{kind}={name}: is a keyword of Python; give yours another name")
+                raise ConfigError(f"{kind}={name}: is a Python keyword; choose another name")
             if (kind, name) in built_in():
-                raise ConfigError(f"{kind}={name}: is built in and is not replaced; give yours another name")
+                raise ConfigError(f"{kind}={name}: is built in and cannot be replaced; choose another name")
 
 
 def _spell_out(arguments: list[str]) -> list[str]:
-    """Let `model=` on the command line be the component's."""
-    # Hydra itself would take `model` for the config group of that name.
+    """Expand `model=` to `component.model=`."""
+    # Hydra would read `model` as the config group of that name.
     return [re.sub(rf"^({'|'.join(EXAMPLES)})=", r"component.\1=", argument) for argument in arguments]
 
 
 def _work(asked: Asked[NewConfig]) -> Callable[[], None]:
     named = [(kind, name) for kind, name in asked.config.component.items() if name is not None]
     if len(named) != 1:
-        raise ConfigError(f"new: name one component, as one of {', '.join(EXAMPLES)}: model=mynet")
+        raise ConfigError(f"new: name one component, as in model=mynet (kinds: {', '.join(EXAMPLES)})")
     ((kind, name),) = named
     if asked.config.to is None:
         raise ConfigError(f"to: missing; write to=FOLDER, as in to=./{name}")

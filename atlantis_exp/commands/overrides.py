@@ -1,4 +1,4 @@
-"""A command line as typed, checked before anything is written: flags, keys, options, sweeps, launchers."""
+"""Check a command line before anything is written: flags, keys, options, sweeps, launchers."""
 
 import argparse
 import itertools
@@ -59,16 +59,16 @@ def flags_of(arguments: Sequence[str]) -> argparse.Namespace:
         known = {option for action in _FLAGS._actions for option in action.option_strings}
         raise ConfigError(f"{unknown[0]}: no such flag; {nearest(unknown[0], known)}")
     if flags.multirun and flags.cfg:
-        raise ConfigError("--cfg job: shows one config; drop -m, and name one value a key")
+        raise ConfigError("--cfg job: shows one config; drop -m, and write one value per key")
     if flags.resolve and not flags.cfg:
         raise ConfigError("--resolve: changes how a config is printed; add --cfg job")
     flags.config_dir = flags.config_dir and absolute("--config-dir", flags.config_dir)
-    flags.overrides = [text.lstrip("+") for text in flags.overrides]  # every key is there already
+    flags.overrides = [text.lstrip("+") for text in flags.overrides]  # every key exists
     return flags
 
 
 def located(arguments: Sequence[str]) -> list[str]:
-    """Return arguments that mean the same in any folder, with `sweep=FILE` filled in. Raises: ConfigError."""
+    """Make paths in arguments absolute, and replace `sweep=FILE` by its overrides. Raises: ConfigError."""
     flags = flags_of(arguments)
     parts = (_from_file(text[6:]) if text.startswith("sweep=") else [text] for text in flags.overrides)
     return [
@@ -81,7 +81,7 @@ def located(arguments: Sequence[str]) -> list[str]:
 
 
 def _from_file(name: str) -> Iterator[str]:
-    """Yield the overrides in a YAML file: for each key a value, a list of values, or Hydra's words for them."""
+    """Yield the overrides in a YAML file: for each key a value, a list of values, or Hydra's syntax for them."""
     try:
         tree = safe_load(read_file(absolute("sweep", name), SMALL))
         leaves = flatten(tree)
@@ -109,7 +109,7 @@ def refuse_twice(arguments: Sequence[str]) -> None:
     given: dict[str, str] = {}
     for text in flags_of(arguments).overrides:
         if (before := given.setdefault(key_of(text), text)) != text:
-            raise ConfigError(f"{text}: {before} says something else; write one of the two")
+            raise ConfigError(f"{text}: contradicts {before}; drop one of them")
 
 
 def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[tuple[str, ...], T]:
@@ -123,7 +123,7 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
         if override.is_sweep_override() and not flags.multirun:
             raise ConfigError(f"{override.input_line}: several values are a sweep; add -m")
         if override.is_delete() and not _key(override).startswith(("phase.", "hydra")):
-            raise ConfigError(f"{override.input_line}: needed; write {_key(override)}=VALUE")
+            raise ConfigError(f"{override.input_line}: the key is required; write {_key(override)}=VALUE")
     launcher(arguments)
     overrides = [override for override in overrides if not _is_hydras(override)]
     admit_plugins(next((override.value() for override in overrides if override.key_or_group == "plugins"), []))
@@ -139,7 +139,7 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
     except (HydraException, OmegaConfBaseException) as error:
         reason = f": {error.__cause__}" if isinstance(error.__cause__, OmegaConfBaseException) else ""
         raise ConfigError(" ".join(re.split("Config search path|full_key:", f"{error}{reason}")[0].split())) from None
-    except (YAMLError, ValueError, TypeError, RecursionError) as error:  # Hydra and OmegaConf trust their files
+    except (YAMLError, ValueError, TypeError, RecursionError) as error:  # Hydra and OmegaConf do not check their files
         if own is None or isinstance(error, ConfigError):
             raise
         reason = " ".join(str(error).split())
@@ -170,9 +170,9 @@ def launcher(arguments: Sequence[str]) -> Launcher:
         if key == "hydra.mode":
             raise ConfigError(f"{text}: write -m for a sweep")
         if override.is_delete() or not (is_choice or key.startswith("hydra.launcher.")):
-            raise ConfigError(f"{text}: use only hydra/launcher=NAME and hydra.launcher.KEY=VALUE of Hydra's keys")
+            raise ConfigError(f"{text}: of Hydra's keys, only hydra/launcher and hydra.launcher.KEY can be set")
         if not flags.multirun:
-            raise ConfigError(f"{text}: applies to a sweep; add -m, or leave it out")
+            raise ConfigError(f"{text}: applies to a sweep; add -m or drop it")
         if is_choice:
             name = str(override.value())
     names = ["basic", *(path.stem for path in _LAUNCHERS.glob("*.yaml"))]
@@ -181,7 +181,7 @@ def launcher(arguments: Sequence[str]) -> Launcher:
     if name == "slurm" and find_spec("submitit") is None:
         raise ConfigError("hydra/launcher=slurm: needs pip install 'atlantis-exp[slurm]'")
     if name == "slurm" and shutil.which("srun") is None:
-        raise ConfigError("hydra/launcher=slurm: srun is missing here; submit from a machine of the cluster")
+        raise ConfigError("hydra/launcher=slurm: srun is not installed; submit from a node of the cluster")
     settings = DictConfig({}) if name == "basic" else OmegaConf.load(_LAUNCHERS / f"{name}.yaml")
     assert isinstance(settings, DictConfig)
     for override in overrides:
@@ -190,12 +190,12 @@ def launcher(arguments: Sequence[str]) -> Launcher:
     if name == "basic":
         return BASIC
     if settings.get("n_jobs") == 0:
-        raise ConfigError("hydra.launcher.n_jobs=0: write the number of jobs at a time, or -1 for one a core")
+        raise ConfigError("hydra.launcher.n_jobs=0: write the number of jobs at a time, or -1 for one per core")
     return Launcher(name, OmegaConf.to_container(settings))  # type: ignore[arg-type]
 
 
 def _set_up(settings: DictConfig, override: Override) -> None:
-    """Change one setting of a launcher; keys below it are free."""
+    """Change one setting of a launcher; keys below it are not checked."""
     key, value = override.key_or_group.removeprefix("hydra.launcher."), override.value()
     first, _, below = key.partition(".")
     if first not in settings:
@@ -214,10 +214,10 @@ def read_override(text: str) -> Override:
         raise ConfigError(f"'{text}' is not an override; write KEY=VALUE, as in model=resnet")
     try:
         return _PARSER.parse_override(text)
-    except ValueError:  # Python's
+    except ValueError:  # Python's limit
         raise ConfigError(f"{text[:60]}...: a number of more than 4,300 digits") from None
     except RecursionError:
-        raise ConfigError(f"{text[:60]}...: lists within lists, too deep to be read") from None
+        raise ConfigError(f"{text[:60]}...: lists nested too deeply") from None
     except HydraException:
         raise ConfigError(
             f"{text}: not readable; write KEY=VALUE, a list as KEY=[1,2], other characters in quotes as KEY='\"a ü\"'"
@@ -246,7 +246,7 @@ def _jobs(overrides: list[Override]) -> Iterator[list[str]]:
 def combined(choices: Sequence[Sequence[str]]) -> Iterator[tuple[str, ...]]:
     """Return the product of choices. Raises: ConfigError for too many."""
     if (count := math.prod(map(len, choices))) > _MOST_JOBS:
-        raise ConfigError(f"these values make {count:,} jobs, more than {_MOST_JOBS:,}: name fewer")
+        raise ConfigError(f"these values make {count:,} jobs; write values for at most {_MOST_JOBS:,}")
     return itertools.product(*choices)
 
 
@@ -310,7 +310,7 @@ def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | 
             _check_keys(values, _keys(config_name, chosen, own), groups)
             raise
         if OmegaConf.select(composed, "plugins") and "plugins" not in {_key(each) for each in overrides.values()}:
-            raise ConfigError(f"--config-dir={own}: names plugins; only the command line may, as plugins=./FILE.py")
+            raise ConfigError(f"--config-dir={own}: names plugins; name them on the command line, as plugins=./FILE.py")
         return checked(schema, composed)
     except InterpolationKeyError as error:
         missing = "".join(re.findall("'(.*)'", str(error)))
@@ -332,11 +332,11 @@ def _check_config_dir(folder: Path) -> None:
     if not folder.is_dir():
         raise ConfigError(f"--config-dir={folder}: no such folder")
     if (folder / "hydra").exists():
-        raise ConfigError(f"--config-dir={folder}: its group hydra/ would name code; only groups of ours are read")
+        raise ConfigError(f"--config-dir={folder}: its group hydra/ could name code; remove it")
     for group in sorted(path for path in CONF.iterdir() if path.is_dir()):
         ours = {path.name for path in group.glob("*.yaml")}
         if taken := sorted(path for path in (folder / group.name).glob("*.yaml") if path.name in ours):
-            raise ConfigError(f"{taken[0]}: {group.name}={taken[0].stem} is ours and is not replaced; rename yours")
+            raise ConfigError(f"{taken[0]}: {group.name}={taken[0].stem} is built in; rename yours")
 
 
 def _offered(folder: str, name: str) -> str:
@@ -346,7 +346,7 @@ def _offered(folder: str, name: str) -> str:
 
 
 def _composed(config_name: str, overrides: Sequence[Override], own: Path | None) -> DictConfig:
-    """Compose a config as Hydra does, whose slow part many jobs of a sweep share."""
+    """Compose a config as Hydra does; jobs of a sweep share the slow part."""
     groups = _groups(config_name)
     choices = tuple(str(each.input_line) for each in overrides if _key(each) in groups)
     config = deepcopy(_chosen(config_name, choices, own))
@@ -361,7 +361,7 @@ def _chosen(config_name: str, choices: tuple[str, ...], own: Path | None) -> Dic
 
 
 def _keys(config_name: str, choices: tuple[str, ...], own: Path | None) -> frozenset[str]:
-    """Return the keys that the chosen options of groups give."""
+    """Return the keys of the chosen options of groups."""
     tree: Any = OmegaConf.to_container(_chosen(config_name, choices, own))
     return frozenset(flatten(tree))
 

@@ -1,4 +1,4 @@
-"""`python -m atlantis_exp play player=NAME`: a person at the keyboard as a tracked run."""
+"""`python -m atlantis_exp play player=NAME`: track a person at the keyboard."""
 
 from collections.abc import Callable
 from functools import partial
@@ -16,7 +16,7 @@ class PlayConfig:
     """A tracked run of a person."""
 
     player: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")]
-    scale: Annotated[int, Field(ge=1, le=10)]  # window pixels a screen pixel
+    scale: Annotated[int, Field(ge=1, le=10)]  # window pixels per screen pixel
     env: Env
     evaluation: EvaluationConfig
     tracking: TrackingConfig

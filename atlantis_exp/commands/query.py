@@ -11,7 +11,7 @@ from atlantis_exp.config import STRICT, Env, Format
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class QueryConfig:
-    """The environment query of report figures 1.1 to 1.3."""
+    """A query of the environment."""
 
     env: Env
     format: Format

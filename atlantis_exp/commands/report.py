@@ -1,4 +1,4 @@
-"""`python -m atlantis_exp report`: the results that the outputs folder holds, as a table."""
+"""`python -m atlantis_exp report`: print the results in the outputs folder as a table."""
 
 from collections.abc import Callable
 from functools import partial
@@ -13,7 +13,7 @@ from atlantis_exp.config import STRICT, Format, PathsConfig
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class ReportConfig:
-    """Which runs the table has."""
+    """The runs in the table."""
 
     runs: list[str]  # names, starts of names or patterns; none: all
     where: list[str]  # KEY=VALUE; none: all

@@ -1,4 +1,4 @@
-"""`python -m atlantis_exp search optimizer=adam,rmsprop trials=20`: the best values of any keys, by Optuna."""
+"""`python -m atlantis_exp search optimizer=adam,rmsprop trials=20`: find the best values of any keys with Optuna."""
 
 import dataclasses
 from collections.abc import Callable
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from atlantis_exp.sessions.search import Search
 
 
-_FIRST_SEED = 1_000  # behind all that `decide` trains
+_FIRST_SEED = 1_000  # above all seeds that `decide` trains
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class PruningConfig:
-    """When a trial below the median of the others at the same evaluation is cut short."""
+    """When to prune a trial: if it is below the median of the others at the same evaluation."""
 
-    trials: Count | None  # that end before any is cut short; null: none is
-    evaluations: Annotated[int, Field(ge=0)]  # a trial's first ones, at which it is never cut short
+    trials: Count | None  # that must end before any is pruned; null: never prune
+    evaluations: Annotated[int, Field(ge=0)]  # first ones of a trial, at which it is never pruned
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
@@ -36,11 +36,11 @@ class SearchConfig(Config):
     """A training's config, and the search for the best values of some of its keys."""
 
     trials: Count
-    seeds: Count  # trainings a trial
+    seeds: Count  # trainings per trial
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,59}$")] | None
     startup: Annotated[int, Field(ge=0)]  # trials drawn at random
     pruning: PruningConfig
-    space: dict[str, str]  # the values of each key, in Hydra's words: `tag(log, interval(1e-5, 1e-3))`
+    space: dict[str, str]  # the values of each key, in Hydra's syntax: `tag(log, interval(1e-5, 1e-3))`
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -56,7 +56,7 @@ CLOSED = _OWN | FREE | {"seed", "evaluation"}
 
 
 def _first_trial(arguments: list[str]) -> list[str]:
-    """Take the first of the values that a key is to be searched among."""
+    """Keep only the first value of each searched key."""
     if {"-m", "--multirun"} & set(arguments):
         raise ConfigError("-m: a search is not a sweep; drop -m")
     refuse_twice([argument.removeprefix("space.") for argument in arguments])
@@ -72,7 +72,7 @@ def _work(asked: Asked[SearchConfig]) -> Callable[[], None]:
 
 
 def search_of(asked: Asked[SearchConfig]) -> "Search":
-    """Return the search that was asked for. Raises: ConfigError if a value of the space is not valid."""
+    """Return the search that was asked for. Raises: ConfigError if a value of the space is invalid."""
     from atlantis_exp.commands.space import check_space, read_space
     from atlantis_exp.sessions.search import Search
 

@@ -23,7 +23,7 @@ Space = Mapping[str, Distribution]
 
 
 def read_space(texts: Mapping[str, str], closed: set[str]) -> Space:
-    """Return the distributions of texts; closed: first parts of keys that are not searched. Raises: ConfigError."""
+    """Parse the distribution of each key; `closed` has the first parts of keys to refuse. Raises: ConfigError."""
     return {key: _read(key, text, closed) for key, text in texts.items()}
 
 
@@ -63,7 +63,7 @@ def check_space(space: Space, overrides: Sequence[str]) -> Job:
     """Compose the configs at the corners of a space and return the first. Raises: ConfigError."""
     fixed = {key_of(text) for text in flags_of(overrides).overrides}
     if twice := sorted(fixed & space.keys()):
-        raise ConfigError(f"{twice[0]}: has one value and is to be searched; drop one of them")
+        raise ConfigError(f"{twice[0]}: is both fixed and searched; drop one of them")
     ends = {
         key: drawn.choices if isinstance(drawn, CategoricalDistribution) else (drawn.low, drawn.high)
         for key, drawn in space.items()

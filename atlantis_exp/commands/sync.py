@@ -1,4 +1,4 @@
-"""`python -m atlantis_exp sync`: run folders into an MLflow store or to a server."""
+"""`python -m atlantis_exp sync`: publish run folders to an MLflow store or a server."""
 
 from collections.abc import Callable
 from functools import partial
@@ -16,15 +16,15 @@ from atlantis_exp.faults import ConfigError
 class SyncConfig:
     """Where to publish run folders, and how often."""
 
-    every: str | Count | None  # time between two looks, a number alone in seconds; null: one look
-    to: str | None  # a server's address: this one instead of the store that `tracking` names
+    every: str | Count | None  # time between two passes, seconds without a unit; null: one pass
+    to: str | None  # a server's address; null: the store of `tracking`
     tracking: TrackingConfig
     paths: PathsConfig
 
     def __post_init__(self) -> None:
         check_server("to", self.to)
         if self.tracking.name == "none":
-            raise ConfigError("tracking=none: names no store to bring up to date; choose tracking=mlflow or server")
+            raise ConfigError("tracking=none: has no store to publish to; choose tracking=mlflow or server")
         check_time("every", self.every, "30s, 10min or 1h30m")
 
     @property

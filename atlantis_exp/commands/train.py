@@ -1,4 +1,4 @@
-"""`python -m atlantis_exp [train] overrides`: one run; the same command again continues or reports it."""
+"""`python -m atlantis_exp [train] overrides`: train a network, continue it, or print its result."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -33,7 +33,7 @@ def _sweep(asked: Sequence[Asked[Config]], launcher: Launcher, arguments: Sequen
 
 
 def train_on_a_node(overrides: Sequence[str]) -> None:
-    """Train what one job's overrides ask for, in a process that Slurm has started. Raises: Fault."""
+    """Train one job in a process that Slurm has started. Raises: Fault."""
     from atlantis_exp.sessions.training import train
 
     (asked,) = VERB.asked(overrides)

@@ -1,4 +1,4 @@
-"""`python -m atlantis_exp ui`: the MLflow UI on the local store."""
+"""`python -m atlantis_exp ui`: serve the MLflow UI on the local store."""
 
 from collections.abc import Callable
 from functools import partial

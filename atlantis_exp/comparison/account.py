@@ -1,8 +1,8 @@
-"""Keep one account of error for runs, however a question about them is put.
+"""Keep one account of the error spent on runs, however questions about them are put.
 
-It is read from the folders of all comparisons under an outputs folder: `config.json` says what each compared,
-`looks.json` what its looks found and spent. A question continues the looks of an earlier one that compared its pairs of
-groups, alone or among others, and is told what other questions about any of its runs have spent.
+It is read from the folders of all comparisons under an outputs folder: `config.json` has the groups compared,
+`looks.json` the looks with their findings and error. A question continues the looks of an earlier one that compared its
+pairs of groups, alone or among others. It also says how much other questions about its runs have spent.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -22,26 +22,26 @@ from atlantis_exp.runs.folder import LOOKS, RunFolder
 
 @dataclass(frozen=True)
 class Asked:
-    """A question that was asked of runs, as its folder keeps it."""
+    """A question about runs, as its folder keeps it."""
 
     by: list[str]
     error: float
     delta: float | None
     relative: bool
     baseline: str | None
-    groups: Sequence[list[str] | str]  # label and the recipes of its runs: all that they are but for their seeds
-    compared: list[str]  # all runs that it was ever asked of
-    account: str = ""  # the comparison whose looks it continues; empty: its own
+    groups: Sequence[list[str] | str]  # label, and hashes of its runs without their seeds
+    compared: list[str]  # all runs that it was ever asked about
+    account: str = ""  # the comparison whose looks it continues; empty for its own
     errors: dict[str, float] = field(default_factory=dict)  # of the families that continue one
-    score: str = "last"  # which score of a seed
+    score: str = "last"  # as in `Question`
     window: float | None = None
-    scores: str = ""  # the table that groups without recipes are from
+    scores: str = ""  # the table of groups without recipes
     name: str = ""
     record: Record = field(default_factory=dict)
 
     @property
     def identities(self) -> dict[str, tuple[str, ...]]:
-        """The identity of each group, which no choice of words changes; groups of one recipe have their labels, too."""
+        """The identity of each group, whatever its label; groups of one recipe have their labels, too."""
         rows = [[each, self.scores] if isinstance(each, str) else each for each in self.groups]
         recipes = {label: tuple(recipes) for label, *recipes in rows}
         if len({*recipes.values()}) == len(recipes):
@@ -50,12 +50,12 @@ class Asked:
 
     @property
     def root(self) -> str:
-        """The comparison whose account it shares."""
+        """The comparison that keeps its account."""
         return self.account or self.name
 
     @property
     def measure(self) -> tuple[object, ...]:
-        """Which score it is about, and which difference does not matter."""
+        """The score, and the difference that does not matter."""
         return self.score, self.window, self.delta, self.relative, self.relative and self.baseline
 
     @property
@@ -64,20 +64,20 @@ class Asked:
         return sum(look.error for looks in self.record.values() for look in looks)
 
     def shares_runs(self, other: "Asked") -> bool:
-        """Return whether both were asked of a run, or of the same table."""
+        """Return whether both are about a common run or table."""
         return bool({*self.compared} & {*other.compared}) or bool(self.scores and self.scores == other.scores)
 
 
 @dataclass(frozen=True)
 class Account:
-    """What a question may still spend, and what must be said of it."""
+    """The error that a question may still spend, and remarks on it."""
 
     record: Mapping[str, Sequence[Look]] = field(default_factory=dict)
     errors: Mapping[str, float] = field(default_factory=dict)  # of families that continue an earlier one
     root: str = ""  # the comparison that was continued
-    compared: Sequence[str] = ()  # all runs that were ever asked
+    compared: Sequence[str] = ()  # all runs that it was ever asked about
     lines: Sequence[str] = ()
-    is_warned: bool = False  # whether the lines speak of other questions or of missing runs
+    is_warned: bool = False  # whether the lines name other questions or missing runs
 
     def limit(self, asked: Sequence[Family]) -> list[Family]:
         """Return the families with the error that the account leaves them."""
@@ -87,7 +87,7 @@ class Account:
 
     @property
     def kept(self) -> dict[str, Any]:
-        """What the comparison's folder keeps of it."""
+        """The part that the comparison's folder keeps."""
         continued = {"account": self.root, "errors": dict(self.errors)} if self.errors else {}
         return {"compared": list(self.compared), **continued}
 
@@ -125,11 +125,11 @@ def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], 
     """Return the account of a question.
 
     Each family takes over the longest looks of an earlier question with the same measure and all its pairs, if they
-    begin with its own. Of the error that question has left it may spend the share of its open pairs.
+    begin with its own. Of that question's remaining error it may spend the share of its open pairs.
 
     Args:
-        mine: the question, with its own looks so far and all runs that it was ever asked of.
-        runs: those that it is asked of now.
+        mine: the question, with its own looks so far and all runs that it was ever asked about.
+        runs: the runs that it is asked about now.
     """
     if not asked:
         return Account(compared=mine.compared)
@@ -145,12 +145,12 @@ def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], 
         record[family.name], errors[family.name] = part.looks, part.error
         roots.append(other.root)
         if other.root != mine.name:
-            of = "" if part.of == 1 else f", of whose {part.of} pairs it is a part"
+            of = "" if part.of == 1 else f", which has {part.of} pairs in all"
             is_spent = part.error - sum(look.error for look in part.looks) < 1e-9
             left = "; to look further, allow a larger error=" if is_spent and _open(part.looks[-1]) else ""
             lines.append(f"By {family.name}, this continues the looks of {other.name}{of}{left}.")
     root = roots[0] if len({*roots}) == 1 else mine.name
-    sizes = _sizes(record)  # and those that it will look at
+    sizes = _sizes(record)  # and those of the looks to come
     sizes |= {size for family in asked for size in family.plan.looks if size > max(sizes, default=0)}
     told: dict[str, float] = {}  # error spent, by account
     groups = {*mine.identities.values()}
@@ -163,7 +163,7 @@ def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], 
         questions = "1 other question" if len(told) == 1 else f"{len(told)} other questions"
         spent = f"{sum(told.values()):.2%}"
         lines.append(
-            f"These runs have been asked {questions}, which spent {spent}; the error of this one is on top of it."
+            f"{questions} about these runs spent {spent} of error; the error of this question is on top of it."
         )
     same = [other for other in others if {*other.identities.values()} == groups and mine.shares_runs(other)]
     if gone := sorted({*mine.compared}.union(*(other.compared for other in same)) - {*runs}):
@@ -175,7 +175,7 @@ def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], 
 
 
 def seeds_between(seeds: Mapping[str, Collection[int]], lost: Collection[int] = ()) -> dict[str, list[int]]:
-    """Return the seeds that groups lack although others have them and they have later ones, but for lost ones."""
+    """Return the seeds that a group lacks below its last one, though another group has them; `lost` ones excluded."""
     every = {seed for own in seeds.values() for seed in own} - {*lost}
     missing = {label: sorted(seed for seed in every - {*own} if seed < max(own)) for label, own in seeds.items()}
     return {label: found for label, found in missing.items() if found}
@@ -198,15 +198,15 @@ def _open(look: Look) -> int:
 
 
 class _Part(NamedTuple):
-    """The looks of another question at a family's pairs."""
+    """Another question's looks at a family's pairs."""
 
     looks: list[Look]
-    error: float  # that the family has, spent and left
-    of: int  # pairs of the other question; 1: it has no other ones
+    error: float  # of the family, spent and left
+    of: int  # pairs of the other question; 1 if it has the same ones
 
 
 def _part(family: Family, asked: Sequence[Family], mine: Asked, other: Asked) -> _Part | None:
-    """Return another question's looks at all pairs of a family; None if there are none that it may continue."""
+    """Return another question's looks at all pairs of a family; None if the family cannot continue them."""
     if not other.record or mine.measure != other.measure or not mine.shares_runs(other):
         return None
     if family is asked[-1]:  # all groups
@@ -235,13 +235,13 @@ def _part(family: Family, asked: Sequence[Family], mine: Asked, other: Asked) ->
             seeds = {labels[name]: chosen for name, chosen in look.seeds.items() if labels.get(name) in names}
             share = len(verdicts) / len(look.verdicts) if mine.delta is None else len(pairs) / every
             looks.append(Look(seeds, share * look.error, verdicts))
-    # The families of either question share its error, and a part that the other one is has a share of that.
+    # The families of either question share its error; if the other one is itself a part, it has a share of that.
     allowed = family.plan.error * len(asked) / max(len(asked), len(other.record))
     allowed *= min(1.0, other.errors.get(source, 1.0) * len(other.record) / other.error)
     left = allowed - sum(look.error for look in whole)
     if left < -1e-9:
         return None
-    # As at the other question's next look, its open pairs share what is left; with delta all of its pairs do.
+    # As at the other question's next look, its open pairs share the rest; with delta all of its pairs do.
     share = len(pairs) / every
     if mine.delta is None and every > len(pairs):
         share = _open(looks[-1]) / max(_open(whole[-1]), 1)

@@ -1,4 +1,4 @@
-"""Choose runs by their configs and tags, group them, and refuse groups whose scores do not mean the same."""
+"""Select runs by config and tags, group them, and refuse groups whose scores are not comparable."""
 
 import json
 from collections import defaultdict
@@ -17,15 +17,15 @@ PROTOCOL = (
     *("env.id", "env.frameskip", "env.sticky", "env.max_frames", "env.max_steps", "env.noop_max", "env.max_pool"),
     *("env.crop", "evaluation.epsilon"),
 )
-"""What must be equal for scores to mean the same; the observation's size belongs to the network."""
+"""The keys that must be equal for scores to be comparable; the observation's size belongs to the network."""
 
 COMMIT = "git.commit"
-"""The key whose values are commits."""
+"""The tag of a run's commit."""
 _COMMIT_DIGITS = 10
 
 
 def select(runs: Iterable[R], where: Sequence[str]) -> list[R]:
-    """Return the runs for which all of KEY=VALUE hold, with keys as `group` takes them. Raises: ConfigError."""
+    """Return the runs that have every KEY=VALUE, with keys as in `group`. Raises: ConfigError."""
     runs = list(runs)
     for text in where:
         key, equals, _ = text.partition("=")
@@ -36,15 +36,15 @@ def select(runs: Iterable[R], where: Sequence[str]) -> list[R]:
 
 
 def is_where(run: Run, where: Sequence[str]) -> bool:
-    """Return whether all of KEY=VALUE hold for a run."""
+    """Return whether a run has every KEY=VALUE."""
     facts = run.facts
     return all(_is(facts.get(resolve(key, facts)), value) for key, _, value in (text.partition("=") for text in where))
 
 
 def group(runs: Iterable[R], by: Sequence[str]) -> dict[str, list[R]]:
-    """Group runs by config keys or tags, `model` being short for `model.name`; in the order of the groups' labels.
+    """Group runs by config keys or tags, with `model` short for `model.name`; sort the groups by label.
 
-    Raises: ConfigError on a key that no run has.
+    Raises: ConfigError for a key that no run has.
     """
     runs = list(runs)
     for key in by:
@@ -56,7 +56,7 @@ def group(runs: Iterable[R], by: Sequence[str]) -> dict[str, list[R]]:
 
 
 def values_in(facts: Mapping[str, Any], by: Sequence[str]) -> tuple[str, ...]:
-    """Return the value of each key as people write it; a commit by its first digits."""
+    """Return the values of keys as people write them; commits by their first digits."""
     values = []
     for key in by:
         name = resolve(key, facts)
@@ -72,7 +72,7 @@ def resolve(key: str, config: Mapping[str, Any]) -> str:
 
 
 def shortened(keys: Iterable[str], facts: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return keys in their short forms, each once, in the alphabetical order of the dotted ones."""
+    """Return distinct keys in short form, in the order of their dotted forms."""
     short = []
     for key in sorted(keys, key=lambda key: resolve(key, facts)):
         stem = key.removesuffix(".name").removesuffix(".id")
@@ -81,9 +81,9 @@ def shortened(keys: Iterable[str], facts: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def mixed_protocol(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -> tuple[str, str] | None:
-    """Return which part of the protocol differs, `game` or a key, and a sentence about it; None if scores compare.
+    """Return the part of the protocol that differs, `game` or a key, and a sentence; None if scores are comparable.
 
-    Keys of `by` may differ, except the game. Configs are by the names of runs or contenders, with dotted keys.
+    Keys of `by` may differ, except the game. `configs` has dotted keys by the name of a run or contender.
     """
     games = {name: title_of(config["env.id"]) for name, config in configs.items()}
     if len(set(games.values())) > 1:
@@ -97,7 +97,7 @@ def mixed_protocol(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) 
 
 
 def refuse_mixed_protocols(trainings: Sequence[Training], by: Sequence[str]) -> None:
-    """Raise ConfigError if trainings differ in their protocol, other than in keys of `by`."""
+    """Raise ConfigError if trainings differ in a part of their protocol that is not in `by`."""
     if mixed := mixed_protocol({training.name: training.config for training in trainings}, by):
         key, sentence = mixed
         hint = {
@@ -110,7 +110,7 @@ def refuse_mixed_protocols(trainings: Sequence[Training], by: Sequence[str]) -> 
 
 
 def holders(values: Mapping[str, str]) -> str:
-    """Say which names have which value: the first of them, and how many more."""
+    """Return each value with its first name and the number of others."""
     names = defaultdict(list)
     for name, value in values.items():
         names[value].append(name)
@@ -121,7 +121,7 @@ def holders(values: Mapping[str, str]) -> str:
 
 
 def plays_alike(player: Player, trainings: Iterable[Training]) -> bool:
-    """Return whether all play the same game; the crop belongs to a network, as epsilon does."""
+    """Return whether a player and all trainings play the same game; crop and epsilon belong to a network."""
     keys = {*PROTOCOL} - ({"env.crop"} if "weights" in player.config else {"env.crop", "evaluation.epsilon"})
     return all(player.config.get(key) == training.config[key] for training in trainings for key in keys)
 
@@ -132,7 +132,7 @@ def _check_key(option: str, key: str, runs: Sequence[Run]) -> None:
 
 
 def _is(value: Any, text: str) -> bool:
-    """Return whether a text writes a value: as Python or JSON do, a number in any way."""
+    """Return whether a text is a value as Python or JSON write it; a number may be in any form."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         with suppress(ValueError):
             return float(text) == value

@@ -1,11 +1,11 @@
-"""Decide which of several groups of seeds plays better, by a test that may be looked at more than once.
+"""Decide which of several groups of seeds plays better, with a test that allows several looks.
 
-A `Plan` says at which numbers of seeds to look, and which error all pairs and all looks share. `decide` takes the look
-that is due; the record of looks that it returns is the input of the next call. Each look tests by Welch's t with the
-error that it may spend (Lan and DeMets 1983; quadratic in the number of seeds, Kim and DeMets 1987), divided among the
-pairs that are open (Holm 1979). Both divisions are Bonferroni's, so they hold for any number of looks and for pairs
-that share a group. They do not hold if the scores say when to look, or if groups of one mean differ in shape:
-`condition` says how far a verdict is from that.
+A `Plan` has the numbers of seeds at which to look, and the error that all pairs and looks share. `decide` takes the
+look that is due; the next call takes the record of looks that it returns. Each look is Welch's t-test at the error that
+it may spend (Lan and DeMets 1983; quadratic in the number of seeds, Kim and DeMets 1987), divided among the open pairs
+(Holm 1979). Both divisions are Bonferroni's: they hold for any number of looks and for pairs that share a group. They
+fail if scores decide when to look, or if groups of equal mean differ in shape; `condition` tells how much a verdict
+depends on that.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -22,23 +22,23 @@ from atlantis_exp.statistics import probability_of_improvement
 Values = npt.NDArray[np.float64]
 Pair = tuple[str, str]
 
-FEWEST_SEEDS = 5  # a group; with fewer nothing is decided
+FEWEST_SEEDS = 5  # per group; with fewer nothing is decided
 
 
 def looks_up_to(seeds: int) -> tuple[int, ...]:
-    """Return the looks of a plan that ends at `seeds` a group: each halving down to five, so 20 gives 5, 10, 20."""
+    """Return the looks of a plan up to `seeds` per group, halved down to five: 20 gives 5, 10, 20."""
     return (*(looks_up_to(seeds // 2) if seeds // 2 >= FEWEST_SEEDS else ()), seeds)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """At which numbers of seeds a group a comparison looks, and what it may get wrong."""
+    """The looks of a comparison, and the error that it allows."""
 
-    looks: tuple[int, ...] = looks_up_to(10)  # seeds a group, rising from `FEWEST_SEEDS` or more
+    looks: tuple[int, ...] = looks_up_to(10)  # seeds per group, rising from `FEWEST_SEEDS` or more
     error: float = 0.05  # probability of any false verdict, over all pairs and all looks
-    delta: float | None = None  # a difference below it does not matter; without it nothing is found equivalent
-    relative: bool = False  # whether delta is a share of the baseline's mean, without a baseline of the pair's mean
-    baseline: str | None = None  # the group that each other one is compared with, in place of all pairs
+    delta: float | None = None  # smaller differences do not matter; None: no pair is found equivalent
+    relative: bool = False  # whether delta is a share of the baseline's mean, or else of the pair's
+    baseline: str | None = None  # the group to compare each other one with; None: all pairs
 
     def pairs(self, groups: Collection[str]) -> list[Pair]:
         """Return the pairs that are compared, by name: each group with the baseline, or each with each."""
@@ -47,16 +47,16 @@ class Plan:
         return [(group, self.baseline) for group in sorted(groups) if group != self.baseline]
 
     def spendable(self, seeds: int) -> float:
-        """Return the error that looks up to so many seeds may spend: error x (seeds / last look)^2."""
+        """Return the error that looks at up to `seeds` may spend: error x (seeds / last look)^2."""
         return self.error * min(1.0, seeds / self.looks[-1]) ** 2
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What one look said of the mean over one group's seeds less that over another's; NaN before the first look.
+    """One look's finding on the difference between the means of two groups; NaN before the first look.
 
-    The verdict rests on the interval: it leaves out zero, or lies within delta, exactly if that was found. It covers
-    with at least 1 - the plan's error whenever the looks stop, for groups that differ in their mean only.
+    The verdict rests on the interval: it excludes zero, or lies within delta, exactly if that was found. It covers with
+    at least 1 - the plan's error whenever the looks stop, for groups that differ only in their mean.
     """
 
     group: str
@@ -65,29 +65,29 @@ class Verdict:
     difference: float = np.nan
     low: float = np.nan
     high: float = np.nan
-    seeds: int = 0  # of each of the two groups, that it rests on
-    detectable: float | None = None  # the difference found with 80 % at these spreads; after the last look, undecided
+    seeds: int = 0  # of each of the two groups
+    detectable: float | None = None  # found with 80 % at these spreads; only if undecided at the end
 
     @property
     def turned(self) -> "Verdict":
-        """The same of the other group, against this one."""
+        """The same verdict, seen from the other group."""
         said: Said = {"better": "worse", "worse": "better"}.get(self.said, self.said)  # type: ignore[assignment]
         of = {"group": self.other, "other": self.group, "difference": -self.difference}
         return replace(self, said=said, low=-self.high, high=-self.low, **of)  # type: ignore[arg-type]
 
     @property
     def leading(self) -> "Verdict":
-        """It, seen from the group with the higher mean."""
+        """The same verdict, seen from the group with the higher mean."""
         return self if self.difference > 0 else self.turned
 
 
 @dataclass(frozen=True)
 class Look:
-    """One look that was taken, and all that the next one must know of it; `dataclasses.asdict` gives JSON."""
+    """A look that was taken, with all that the next one needs; `dataclasses.asdict` gives JSON."""
 
-    seeds: dict[str, list[int]]  # of each group that was looked at
+    seeds: dict[str, list[int]]  # of each tested group
     error: float  # spent by this look
-    verdicts: list[Verdict]  # of the pairs that were open
+    verdicts: list[Verdict]  # of the pairs open until then
 
     @property
     def size(self) -> int:
@@ -101,11 +101,11 @@ class Decision:
 
     verdicts: list[Verdict]
     looks: list[Look]
-    next_look: int | None  # seeds a contender; None after the last look, and where all pairs are decided
+    next_look: int | None  # seeds per contender; None after the last look, or once all pairs are decided
 
     @property
     def contenders(self) -> list[str]:
-        """The groups in open pairs, which need seeds as long as there is a next look."""
+        """The groups in open pairs, which need seeds while a look is left."""
         return _names((verdict.group, verdict.other) for verdict in self.verdicts if verdict.said == "not decided")
 
     @property
@@ -117,21 +117,20 @@ class Decision:
 def decide(
     groups: Mapping[str, Mapping[int, float]], plan: Plan, looks: Sequence[Look] = (), *, now: bool = False
 ) -> Decision:
-    """Take the look that is due, if one is, and say what is decided.
+    """Take the look that is due, if any, and return all verdicts.
 
-    A look is due when all contenders have the seeds of a planned one that has not been taken, or with `now` at any
-    number of seeds from `FEWEST_SEEDS`. It takes the first n seeds of each contender by number, n being what all of
-    them have and at most the plan's last look, and spends what may be spent by n less what is spent. So a look at the
-    same n costs nothing and finds nothing, and an unplanned look leaves less for those to come. What is decided stays
-    decided.
+    A look is due when all contenders have the seeds of a planned look, or with `now` from `FEWEST_SEEDS` on. It tests
+    the first n seeds of each contender, n being the number that all of them have, at most the plan's last look. It
+    spends the error allowed up to n that earlier looks left. So a second look at n costs and finds nothing, and an
+    unplanned look leaves less for later ones. Decided pairs stay decided.
 
-    If any contender's seeds fall into modes, no group's variance counts for less than the contenders' average: a group
-    whose few seeds all survived is not known to be steady. If no seed of a pair differs from its group's, the
-    difference itself stands for their unknown spread.
+    If any contender's seeds fall into modes, every group's variance is at least the contenders' average: a group whose
+    few seeds all survived is not known to be steady. If the seeds of neither group of a pair differ, the difference
+    itself stands for their unknown spread.
 
     Args:
-        groups: one value a seed, by group and seed.
-        looks: the record of the looks taken at the plan's pairs, in order.
+        groups: one value per seed, by group and seed.
+        looks: the looks taken at the plan's pairs, in order.
     """
     pairs, looks = plan.pairs(groups), list(looks)
     verdicts = {pair: Verdict(*pair) for pair in pairs}
@@ -153,7 +152,7 @@ def decide(
 
 @dataclass(frozen=True)
 class Modes:
-    """The two modes that the seeds of a group fall into, as of those that survive and those that collapse."""
+    """The two modes of a group's seeds, such as seeds that survive and seeds that collapse."""
 
     share: float  # of seeds in the upper mode
     upper: float  # mean of the upper mode
@@ -161,11 +160,11 @@ class Modes:
 
 
 def modes(values: npt.ArrayLike) -> Modes | None:
-    """Return the two modes of values, one a seed; None if they look like one mode or are fewer than three.
+    """Return the two modes of values, one per seed; None for one mode or fewer than three values.
 
-    There are two if the largest gap between neighbours exceeds t(0.9975, n - 2) times the standard deviation within
-    the two parts that it separates: 7.5 times at five seeds, 3.8 times at ten. Normal values seem to be two modes in
-    2 to 5 % of cases.
+    There are two if the largest gap between neighbours exceeds t(0.9975, n - 2) times the standard deviation within the
+    parts that it separates: 7.5 times at five seeds, 3.8 times at ten. Normal values pass for two modes in 2 to 5 % of
+    cases.
     """
     ordered = np.sort(np.asarray(values, np.float64))
     if ordered.size < 3:
@@ -180,9 +179,9 @@ def modes(values: npt.ArrayLike) -> Modes | None:
 
 
 def mean_interval(values: npt.ArrayLike, level: float = 0.95) -> tuple[float, float]:
-    """Return Student's interval of the mean over seeds, one value a seed; NaN for fewer than two.
+    """Return Student's interval of the mean over seeds, one value per seed; NaN for fewer than two.
 
-    `python -m benchmarks.decisions` shows what it covers of values that are not normal.
+    `python -m benchmarks.decisions` measures its coverage for values that are not normal.
     """
     seeds = np.asarray(values, np.float64)
     if seeds.size < 2:
@@ -195,14 +194,14 @@ def detectable(plan: Plan, spread: float, pairs: int = 1) -> float:
     """Return the least difference that the plan's last look finds with 80 %, in the units of `spread`.
 
     Args:
-        spread: standard deviation over seeds of each of the two groups.
-        pairs: in the family, none of which has been decided.
+        spread: standard deviation over seeds in each of the two groups.
+        pairs: number of pairs in the family, all of them open.
     """
     return float(_detectable(_errors(plan)[-1] / pairs, plan.looks[-1], spread))
 
 
 def equivalence(plan: Plan, spread: float, pairs: int = 1) -> float:
-    """Return the least delta within which the last look finds two groups of one mean equivalent with 80 %.
+    """Return the least delta at which the last look finds groups of equal mean equivalent with 80 %.
 
     Units and arguments as for `detectable`.
     """
@@ -211,10 +210,10 @@ def equivalence(plan: Plan, spread: float, pairs: int = 1) -> float:
 
 
 def power(plan: Plan, difference: float, spread: float, pairs: int = 1) -> tuple[float, float]:
-    """Return the probability that the plan finds a difference, and the mean number of seeds a group that it takes.
+    """Return the probability that the plan finds a difference, and the mean number of seeds per group that it takes.
 
-    Both are by the noncentral t of each look alone, as if later looks found all that an earlier one finds: a little
-    less power and more seeds than there will be. Arguments as for `detectable`.
+    Both use the noncentral t of each look alone, as if later looks found all that an earlier one finds: this slightly
+    understates the power and overstates the seeds. Arguments as for `detectable`.
     """
     looks = np.array(plan.looks)
     freedom = 2 * (looks - 1)
@@ -227,11 +226,11 @@ def power(plan: Plan, difference: float, spread: float, pairs: int = 1) -> tuple
 
 @dataclass(frozen=True)
 class Condition:
-    """How much a verdict leans on its condition, that the seeds of both groups differ in their mean only."""
+    """How much a verdict depends on the assumption that two groups differ only in their mean."""
 
-    spreads: float  # the larger standard deviation over the smaller; inf where the seeds of one group are equal
-    undone_by: float  # share of the better group's seeds that would undo the verdict if they scored the floor
-    unseen: float  # share of such seeds that would still escape a look of this size in one of twenty cases
+    spreads: float  # ratio of the standard deviations, at least 1; inf if one group does not vary
+    undone_by: float  # share of the better group's seeds that undoes the verdict by scoring the floor
+    unseen: float  # share of such seeds that a look of this size misses in one of twenty cases
 
 
 def condition(verdict: Verdict, look: Look, groups: Mapping[str, Mapping[int, float]]) -> Condition:
@@ -248,16 +247,16 @@ def condition(verdict: Verdict, look: Look, groups: Mapping[str, Mapping[int, fl
 
 
 def size_found(verdict: Verdict, look: Look) -> float:
-    """Return a decided difference, corrected for the look's finding large ones first (Zhong and Prentice 2008).
+    """Return a decided difference, corrected for the bias that a look finds large ones (Zhong and Prentice 2008).
 
-    Among the differences decided at this look, as many true ones lie above it as below, by the noncentral t.
+    It is the median-unbiased estimate, given that this look decided, by the noncentral t.
     """
     freedom = 2 * (verdict.seeds - 1)
     limit = -stdtrit(freedom, look.error / len(look.verdicts) / 2)
     error = (verdict.high - verdict.low) / 2 / limit
     t = float(abs(verdict.difference) / error)
 
-    def above_half(shift: float) -> float:  # of the differences decided where this is true, the share that is smaller
+    def above_half(shift: float) -> float:  # smaller share of decided differences, less 1/2
         below = 1 - nctdtr(freedom, -shift, limit)
         upto, smaller = nctdtr(freedom, shift, (limit, t))
         return float((below + smaller - upto) / (below + 1 - upto) - 0.5)
@@ -266,9 +265,9 @@ def size_found(verdict: Verdict, look: Look) -> float:
 
 
 def may_be_best(decision: Decision) -> list[str]:
-    """Return the groups that no other was found better than.
+    """Return the groups that were not found worse than another.
 
-    With at least 1 - the plan's error they include the best, if each was compared with each.
+    With at least 1 - the plan's error they include the best, if all pairs were compared.
     """
     beaten = {
         verdict.group if verdict.said == "worse" else verdict.other
@@ -279,15 +278,15 @@ def may_be_best(decision: Decision) -> list[str]:
 
 
 def seeds_needed(difference: float, spread: float, error: float = 0.05, pairs: int = 1) -> int | None:
-    """Return the seeds a group of the shortest plan that finds a difference with 80 %; None beyond a thousand."""
+    """Return the seeds per group of the shortest plan that finds a difference with 80 %; None beyond a thousand."""
     sizes = range(FEWEST_SEEDS, 1_001)
     return next((n for n in sizes if power(Plan(looks_up_to(n), error), difference, spread, pairs)[0] >= 0.8), None)
 
 
 def improvement(one: npt.ArrayLike, other: npt.ArrayLike) -> tuple[float, float, float]:
-    """Return the probability that a seed of one group beats one of another, between the ends of its 95 % interval.
+    """Return the probability that a seed of `one` beats one of `other`, between the ends of its 95 % interval.
 
-    The interval is Newcombe's (2006, method 5), which also holds if all seeds of one group are above the other's.
+    The interval is Newcombe's (2006, method 5), which also holds if one group is entirely above the other.
     """
     seeds, others = np.asarray(one, np.float64), np.asarray(other, np.float64)
     found, half = probability_of_improvement(seeds, others), (seeds.size + others.size) / 2 - 1
@@ -303,7 +302,7 @@ def improvement(one: npt.ArrayLike, other: npt.ArrayLike) -> tuple[float, float,
 
 
 def _falls_to(zero: Callable[[float], float], low: float, high: float) -> float:
-    """Return where a falling function is zero, by halving."""
+    """Find the zero of a falling function by bisection."""
     for _ in range(50):
         middle = (low + high) / 2
         low, high = (middle, high) if zero(middle) > 0 else (low, middle)
@@ -311,19 +310,19 @@ def _falls_to(zero: Callable[[float], float], low: float, high: float) -> float:
 
 
 def _errors(plan: Plan) -> Values:
-    """Return what each planned look spends."""
+    """Return the error that each planned look spends."""
     return np.diff([0.0, *map(plan.spendable, plan.looks)])
 
 
 def _detectable(error: float, size: int, spread: Values | float) -> Values:
-    """Return the difference that Welch's test finds with 80 %, the sum of two quantiles of t."""
+    """Return the difference that Welch's test finds with 80 %: a sum of two quantiles of t."""
     freedom = 2 * (size - 1)
     reach = (-stdtrit(freedom, error / 2) + stdtrit(freedom, 0.8)) * np.sqrt(2 / size)
     return np.asarray(reach * spread, np.float64)
 
 
 def _left(plan: Plan, size: int, looks: Sequence[Look]) -> float:
-    """Return the error that a look at `size` seeds may spend: none if it is not later than those taken."""
+    """Return the error that a look at `size` seeds may spend; none if a look as late was taken."""
     if looks and size <= looks[-1].size:
         return 0.0
     left = plan.spendable(size) - sum(look.error for look in looks)
@@ -341,7 +340,7 @@ def _names(pairs: Iterable[Pair]) -> list[str]:
 def _look(
     groups: Mapping[str, Mapping[int, float]], pairs: Sequence[Pair], family: int, plan: Plan, size: int, error: float
 ) -> Look:
-    """Test the open pairs of a family by the first `size` seeds of each group, and spend `error`."""
+    """Test the open pairs of a family with the first `size` seeds of each group, and spend `error`."""
     seeds = {name: sorted(values)[:size] for name, values in groups.items()}
     values = np.array([[groups[name][seed] for seed in chosen] for name, chosen in seeds.items()], np.float64)
     places = {name: place for place, name in enumerate(seeds)}
@@ -352,7 +351,7 @@ def _look(
     differences = means[one] - means[other]
     spreads = np.sqrt((variances[one] + variances[other]) / 2)
     spreads = np.where(spreads > 0, spreads, np.abs(differences))
-    with np.errstate(invalid="ignore"):  # 0 / 0 where neither group varies
+    with np.errstate(invalid="ignore"):  # 0 / 0 if neither group varies
         share = np.nan_to_num(variances[one] / (variances[one] + variances[other]), nan=0.5)
     freedom = (size - 1) / (share**2 + (1 - share) ** 2)  # Welch and Satterthwaite
     margin = np.full(len(pairs), plan.delta or 0.0)
@@ -362,8 +361,8 @@ def _look(
     half = np.zeros(len(pairs))
     undecided = found = np.ones(len(pairs), bool)
     while found.any() and undecided.any():
-        # Holm's steps: what is decided leaves its error to the others. With delta each pair can be wrong whatever is
-        # true, so that none is spared.
+        # Holm's steps: a decided pair leaves its error to the others. With delta any verdict can be wrong, so that all
+        # pairs keep theirs.
         level = error / (undecided.sum() if plan.delta is None else family)
         half = np.where(undecided, -stdtrit(freedom, level / 2) * spreads * np.sqrt(2 / size), half)
         low, high = differences - half, differences + half

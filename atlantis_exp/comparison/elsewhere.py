@@ -1,4 +1,4 @@
-"""Read the scores of seeds that were trained elsewhere, from a CSV file."""
+"""Read the scores of seeds trained elsewhere from a CSV file."""
 
 import csv
 import io
@@ -19,11 +19,11 @@ _LONGEST = 100  # characters of a group's name
 
 
 def read_scores(path: Path, columns: Mapping[str, str]) -> list[Group]:
-    """Read the groups of a table with a row for each episode, evaluation or seed; rows of one seed are averaged.
+    """Read groups from a table with one row per episode, evaluation or seed; average the rows of a seed.
 
-    columns: the names of the columns for group, seed and score where these are not theirs. No other one is read.
+    columns: names of the columns for group, seed and score, if they differ. Other columns are ignored.
 
-    Raises: ConfigError naming the row and the column that cannot be read.
+    Raises: ConfigError that names the row and the column.
     """
     columns = dict(zip(_COLUMNS, _COLUMNS, strict=True)) | dict(columns)
     found: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
@@ -33,7 +33,7 @@ def read_scores(path: Path, columns: Mapping[str, str]) -> list[Group]:
         for key, name in columns.items():
             if header.count(name) != 1:
                 which = "no such column" if name not in header else "several such columns"
-                which += f"; {nearest(name, header)}; columns={key}=NAME says which"
+                which += f"; {nearest(name, header)}; set columns={key}=NAME"
                 raise ValueError(f"row 1, column {name}: {which}")
         for row in reader:
             label, seed, score = (_read(reader.line_num, row, columns, key) for key in _COLUMNS)
@@ -46,7 +46,7 @@ def read_scores(path: Path, columns: Mapping[str, str]) -> list[Group]:
     except (ValueError, OSError, csv.Error) as error:
         raise ConfigError(f"scores={path}: {getattr(error, 'strerror', None) or error}") from None
     if not found:
-        raise ConfigError(f"scores={path}: row 2, column {columns['group']}: there is no row below the header")
+        raise ConfigError(f"scores={path}: row 2, column {columns['group']}: no row below the header")
     return [
         Group((label,), {seed: fmean(scores) for seed, scores in sorted(seeds.items())})
         for label, seeds in sorted(found.items())
@@ -54,7 +54,7 @@ def read_scores(path: Path, columns: Mapping[str, str]) -> list[Group]:
 
 
 def _read(line: int, row: Mapping[str | None, str | None], columns: Mapping[str, str], key: str) -> str | int | float:
-    """Return what a row says of a key. Raises: ValueError."""
+    """Return a row's value of a key. Raises: ValueError."""
     text = (row[columns[key]] or "").strip()
     place = f"row {line}, column {columns[key]}: {text[:_LONGEST]!r}"
     if key == "group":
@@ -67,6 +67,6 @@ def _read(line: int, row: Mapping[str | None, str | None], columns: Mapping[str,
         value = float("nan")
     if key == "seed" and not 0 <= value < 2**63:
         raise ValueError(f"{place} is not a seed, a whole number from 0 on")
-    if key == "score" and not abs(value) <= 1e15:  # whose squares a mean still holds
+    if key == "score" and not abs(value) <= 1e15:  # so that squares stay finite
         raise ValueError(f"{place} is not a number up to 1e15")
     return value

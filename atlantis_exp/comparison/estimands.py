@@ -1,4 +1,4 @@
-"""Estimate how a training played over its last steps, from the table of its episodes."""
+"""Estimate the score of a training over its last steps from the table of its episodes."""
 
 import csv
 import io
@@ -17,9 +17,9 @@ from atlantis_exp.runs.folder import EPISODES, RunFolder
 
 Array = npt.NDArray[np.float64]
 
-WINDOW = 0.2  # of the steps, the last ones: "the last training episodes" of Machado et al. 2018
+WINDOW = 0.2  # of the steps, at the end: "the last training episodes" of Machado et al. 2018
 FEWEST_EPISODES = 30  # that must end in the window
-_EQUAL = 0.01  # difference in epsilon below which two trainings explored alike
+_EQUAL = 0.01  # largest difference in epsilon between comparable trainings
 
 
 @dataclass(frozen=True)
@@ -44,15 +44,15 @@ class TrainingEpisodes:
 
 
 def training_score(episodes: TrainingEpisodes, steps: int, num_envs: int, window: float = WINDOW) -> float:
-    """Return the mean score of an episode in the last share of a training: its points there over its episodes' ends.
+    """Return the mean score of an episode in the last share of a training: points there, divided by episodes ended.
 
-    The ratio is what renewal theory gives for the mean (Smith 1958). The mean over the episodes that ended in the
-    window is too low while a network learns, since an episode that ends has begun with an earlier one. An episode that
-    began before the window counts with its steps within it, and open episodes with the points a step of the others.
+    Renewal theory gives this ratio for the mean (Smith 1958). The mean over the episodes that ended in the window is
+    too low while a network learns, since they began with an earlier one. An episode that began before the window counts
+    with its steps inside; open episodes count with the points per step of the others.
 
-    steps: of the whole training, of all environments together.
+    steps: of the whole training, over all environments.
 
-    Raises: ValueError where fewer than `FEWEST_EPISODES` episodes ended in the window.
+    Raises: ValueError if fewer than `FEWEST_EPISODES` episodes ended in the window.
     """
     start = steps * (1 - window)
     ended = episodes.ends > start
@@ -78,9 +78,9 @@ def score_of(folder: RunFolder, window: float = WINDOW) -> float:
 def by_training(trainings: Sequence[Training], outputs: Path, window: float) -> list[Training]:
     """Return trainings that count by their training scores.
 
-    None is left out: those whose games are too long to be estimated may be the best ones.
+    None is left out, since those with games too long to estimate may be the best.
 
-    Raises: ConfigError for a training without such a score, or two whose epsilon differs in the window.
+    Raises: ConfigError for a training without such a score, or if epsilon differs in the window.
     """
     explored = {training.name: _epsilon(training, window) for training in trainings}
     least, most = min(explored, key=explored.__getitem__), max(explored, key=explored.__getitem__)
@@ -103,6 +103,6 @@ def by_training(trainings: Sequence[Training], outputs: Path, window: float) -> 
 def _epsilon(training: Training, window: float) -> float:
     """Return the mean epsilon in the last share of a training."""
     if not training.curve:
-        raise ConfigError(f"score=training: {training.name} has no curve, so its epsilon is not known")
+        raise ConfigError(f"score=training: {training.name} has no curve, so its epsilon is unknown")
     frames = training.curve["frames"]
     return float(np.interp(np.linspace(1 - window, 1, 101) * frames[-1], frames, training.curve["epsilon"]).mean())

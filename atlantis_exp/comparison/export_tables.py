@@ -10,7 +10,7 @@ from atlantis_exp.comparison.published import Table
 from atlantis_exp.components import facts_of, known
 
 _FRACTION = "fraction"
-"""The unit of shares and probabilities, from 0 to 1, which LaTeX has in percent, as the page."""
+"""The unit of shares and probabilities, from 0 to 1; LaTeX and the page have them in percent."""
 
 UNITS: Mapping[str, str] = {
     **dict.fromkeys(
@@ -33,27 +33,27 @@ UNITS: Mapping[str, str] = {
     "flops": "FLOPs",
     **dict.fromkeys(("seeds", "next_look"), "seeds"),
 }
-"""The unit of a column of a comparison's tables or of `load_runs`; frames are the emulator's, FLOPs those of gradient
-updates. A column that is not here counts something that its name says, or is not a quantity."""
+"""The units of columns in a comparison's tables and in `load_runs`. Frames are the emulator's, FLOPs those of gradient
+updates. Other columns count what their name says, or are not quantities."""
 
 
 def unit(name: str, column: str) -> str:
-    """Return the unit of a column of a table; empty if it has none, or one for each row (`at` and `x`)."""
+    """Return the unit of a table's column; empty if it has none, or one per row (`at` and `x`)."""
     if name == "why" and column not in COLUMNS["why"]:  # a source of points in the game
         return UNITS["points_per_1000_frames"]
     return UNITS.get(column, "")
 
 
 def with_units(name: str, table: Table) -> Table:
-    """Return the rows with units in their keys, as in `iqm (points)`; a key that is its unit stays, as `frames`."""
+    """Return rows with units in their keys, as in `iqm (points)`; a key that is its own unit stays: `frames`."""
     return [{_with_unit(key, unit(name, key)): value for key, value in row.items()} for row in table]
 
 
 def to_latex(name: str, table: Table) -> str:
-    """Write a table as a LaTeX tabular for the package booktabs; an empty one is an empty text.
+    """Write a table as a LaTeX tabular for the package booktabs; an empty table gives an empty text.
 
-    Columns, headers and cells are the page's; a table that the page does not show has all its columns. Every character
-    that LaTeX would read as more than itself is escaped.
+    Columns, headers and cells are those of the page; a table that is not on the page has all its columns. Characters
+    that are special to LaTeX are escaped.
     """
     if not table:
         return ""
@@ -99,18 +99,18 @@ _LATEX = {
     "<": r"\textless{}",
     ">": r"\textgreater{}",
     "|": r"\textbar{}",
-    '"': r"\symbol{34}",  # which German makes a command
+    '"': r"\symbol{34}",  # a command in German documents
     "`": r"\symbol{96}",
 }
 
 
-@lru_cache(10_000)  # the same labels stand in thousands of rows
+@lru_cache(10_000)  # thousands of rows repeat the same labels
 def _escaped(text: str) -> str:
-    """Write a text as LaTeX that shows its characters on one line; non-printing ones become spaces."""
+    """Escape a text for LaTeX, on one line; non-printing characters become spaces."""
     seen = "".join(" " if unicodedata.category(letter)[0] in "CZ" else letter for letter in text)
     latex = "".join(_LATEX.get(letter, letter) for letter in " ".join(seen.split()))
-    latex = re.sub(r"([-,'])(?=\1)", r"\1{}", latex)  # two of them are a dash or a quotation mark
-    return f"{{}}{latex}" if latex.startswith(("[", "*")) else latex  # else an argument of the line's end before it
+    latex = re.sub(r"([-,'])(?=\1)", r"\1{}", latex)  # two of them make a dash or a quotation mark
+    return f"{{}}{latex}" if latex.startswith(("[", "*")) else latex  # else an argument of the previous line's end
 
 
 def _number(text: str) -> str:

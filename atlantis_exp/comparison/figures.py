@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 _COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 _LINES = ("-", "--", "-.", ":")
 _HEIGHT = 3.2  # inches
-_GREY = "#6e7781"  # of what is averaged over several groups
-_INK = "#24292f"  # of text and axes; a page lets it follow its own
+_GREY = "#6e7781"  # of averages over several groups
+_INK = "#24292f"  # of text and axes; the page replaces it by its own
 _STYLE = {
-    "text.parse_math": False,  # a dollar sign in a name is one
+    "text.parse_math": False,  # names may have dollar signs
     **dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), _INK),
     "font.size": 10,
     "axes.spines.top": False,
@@ -45,16 +45,16 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure as a picture, and as a part of a page that takes on the colour of its text."""
+    """A figure as a PNG, and as an SVG in the text colour of its page."""
 
     title: str
-    alt: str  # what it shows, in words
+    alt: str  # description in words
     png: bytes
     svg: str
 
 
 def draw(comparison: Comparison) -> dict[str, Drawn]:
-    """Draw all figures of a comparison, by name; one without data is left out."""
+    """Draw the figures of a comparison, by name, except those without data."""
     tables, groups, game = comparison.tables, comparison.groups, comparison.game
     drawn = dict[str, Drawn]()
 
@@ -80,7 +80,7 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
     scores = tables["scores"]
     add(
         *("scores", _scores, "Scores"),
-        "One dot a seed, the score as a diamond, with its 95 % interval from five seeds on; scores: "
+        "One dot per seed, the score as a diamond, with its 95 % interval from five seeds on; scores: "
         + _said([row["group"] for row in scores], scores, "score"),
         1.2 + 0.45 * len(scores),
     )
@@ -95,7 +95,7 @@ def draw(comparison: Comparison) -> dict[str, Drawn]:
         return drawn
     add(
         *("distribution", _distribution, "Distribution of the evaluated scores"),
-        "Histogram of evaluated scores, one step line a group; medians: "
+        "Histogram of evaluated scores, one step line per group; medians: "
         + _said(groups, tables["evaluation"], "median"),
     )
     add(
@@ -127,7 +127,7 @@ def _render(plot: Callable[["Axes"], None], title: str, alt: str, height: float 
         figure = Figure(figsize=(4.8, height), dpi=150, facecolor="white", layout="constrained")
         plot(figure.add_subplot())
         png = _png(figure)
-        figure.set_layout_engine("none")  # the layout is found, once for both pictures
+        figure.set_layout_engine("none")  # keep the layout for both pictures
         return Drawn(title, alt, png, _svg(figure, alt))
 
 
@@ -135,7 +135,7 @@ def _png(figure: "Figure") -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     buffer = io.BytesIO()
-    # `savefig` would draw twice, the first time for the layout alone.
+    # `savefig` would draw twice, once for the layout alone.
     FigureCanvasAgg(figure).print_png(buffer)  # type: ignore[no-untyped-call]
     return buffer.getvalue()
 
@@ -145,11 +145,11 @@ def _svg(figure: "Figure", alt: str) -> str:
 
     buffer = io.StringIO()
     for patch in (figure.patch, *(axes.patch for axes in figure.axes)):
-        patch.set_visible(False)  # the page is the ground
+        patch.set_visible(False)  # the page is the background
     FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})  # type: ignore[no-untyped-call]
     svg = buffer.getvalue()[buffer.getvalue().index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    svg = re.sub(r' id="[a-z]+[a-z0-9]*_[0-9]+"', "", svg)  # groups; what is referred to is named by a hash
+    svg = re.sub(r' id="[a-z]+[a-z0-9]*_[0-9]+"', "", svg)  # of groups; what is referred to has a hash as name
     svg = re.sub(r' (width|height)="[0-9.]+pt"', "", svg, count=2)
     svg = svg.replace(_INK, "currentColor").replace("'DejaVu Sans', ", "")
     return svg.replace("<svg", f'<svg role="img" aria-label="{escape(alt)}"', 1)
@@ -177,7 +177,7 @@ def _lines(axes: "Axes", comparison: Comparison, rows: Table, x: str, y: str) ->
 
 
 def thousands(axis: Any) -> None:
-    """Write 20k for 2 x 10^4 at an axis, on a logarithmic one between powers of ten, too."""
+    """Format an axis as 20k for 2 x 10^4, on a logarithmic one also between powers of ten."""
     from matplotlib.ticker import EngFormatter, LogFormatter
 
     written = EngFormatter(sep="")
@@ -185,7 +185,7 @@ def thousands(axis: Any) -> None:
     if axis.get_scale() == "log":
 
         class Between(LogFormatter):
-            """Write numbers between powers of ten where a logarithmic axis has room for them."""
+            """Formats numbers between powers of ten if a logarithmic axis has room."""
 
             def __call__(self, x: float, pos: int | None = None) -> str:
                 return written(x) if super().__call__(x, pos) else ""
@@ -194,20 +194,20 @@ def thousands(axis: Any) -> None:
 
 
 def _rows(axes: "Axes", names: Sequence[str], above: float = 0.8) -> None:
-    """Name the rows of a figure, from above."""
+    """Name the rows of a figure, from the top."""
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.4, -above)
 
 
 def _finish(axes: "Axes", x: str, y: str = "", *, is_logarithmic: bool = False, columns: int = 2) -> None:
-    """Label the axes, and put a legend above them, in as many columns as fit, for which the figure grows."""
+    """Label the axes; grow the figure for a legend above them, in as many columns as fit."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     if is_logarithmic:
         axes.set_xscale("log")
     axes.set_xlabel(f"{x} (logarithmic)" if is_logarithmic else x)
     axes.set_ylabel(y)
-    if x != _UNITS["hours"]:  # half an hour is not 500m
+    if x != _UNITS["hours"]:  # else half an hour would be 500m
         thousands(axes.xaxis)
     figure = axes.get_figure(root=True)
     if figure is None or not axes.get_legend_handles_labels()[0]:
@@ -223,7 +223,7 @@ def _finish(axes: "Axes", x: str, y: str = "", *, is_logarithmic: bool = False, 
 
 
 def _reference_lines(draw_line: Callable[..., Any], comparison: Comparison, low: float, high: float) -> None:
-    """Draw players' scores as grey lines, if within a factor of two, or the width, of the rest."""
+    """Draw players' scores as grey lines, if they are near those of the groups."""
     references = comparison.tables["references"]
     least, most = (low / 2, high * 2) if comparison.game.is_logarithmic else (2 * low - high, 2 * high - low)
     shown = [row for row in references if row["kind"] == "player" and least <= row["score"] <= most]
@@ -238,7 +238,7 @@ def _reference_lines(draw_line: Callable[..., Any], comparison: Comparison, low:
 def _learning(axes: "Axes", comparison: Comparison, axis: str, rows: Table) -> None:
     seeds = [row for row in comparison.tables["seed_curves"] if row["axis"] == axis]
     ends = {row["group"]: row["score"] for row in rows}
-    leading = sorted(ends, key=lambda group: -ends[group])[:2]  # more bands over each other show nothing
+    leading = sorted(ends, key=lambda group: -ends[group])[:2]  # more bands would hide each other
     _lines(axes, comparison, rows, "x", "score")
     for group in comparison.groups:
         look = _look(comparison, group)
@@ -310,7 +310,7 @@ def _why(axes: "Axes", comparison: Comparison) -> None:
             axes.barh(y, row[source], 0.6, left, color=colour, label=label)
             left += row[source]
         said = f"{row['frames_mean']:,.0f} frames"
-        if left != left:  # NaN: an older version recorded the episodes
+        if left != left:  # NaN: recorded by an older version
             axes.barh(y, rate, 0.6, color=_GREY)
             said += ", split not recorded"
         axes.annotate(said, (rate, y), (4, 0), textcoords="offset points", va="center", fontsize=8)

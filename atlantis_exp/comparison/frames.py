@@ -1,4 +1,4 @@
-"""Run folders as pandas data frames, for a notebook; docs/columns.md lists their columns."""
+"""Read run folders as pandas data frames for notebooks; docs/columns.md lists the columns."""
 
 import json
 import sys
@@ -33,7 +33,7 @@ from atlantis_exp.statistics import summarize
 if TYPE_CHECKING:
     import pandas as pd
 
-_TAGS_LEFT_OUT = ("mlflow.", "atlantis.", "group")  # beginnings of tags that are columns of their own
+_TAGS_LEFT_OUT = ("mlflow.", "atlantis.", "group")  # prefixes of tags with columns of their own
 _RUN = ("run", "title", "kind", "group", "state", "error", "started", "updated", "score")
 _EVALUATION = (
     *("run", "step", "source", "folder", "final", "epsilon", "evaluation_seed", "episodes"),
@@ -48,20 +48,19 @@ _FRAMES, _HOURS, _UPDATES = "throughput/frames", "throughput/hours", "learning/u
 _POINT = ("run", "step", "frames", "hours", "flops")
 
 _Parts = tuple[Row, list[Row], list["pd.DataFrame"], list["pd.DataFrame"]]
-"""A run's part of each frame: its row, evaluations, episodes and curve."""
+"""A run's row, evaluations, episodes and curve."""
 
 
 @dataclass(frozen=True)
 class Runs:
-    """What run folders hold, as pandas data frames that share the column `run`.
+    """Run folders as pandas data frames that share the column `run`.
 
-    runs: a row a run: what it counts by in a comparison, config leaves by their dotted keys, the result's numbers, tags
-        as `tag.NAME`.
-    evaluations: a row an evaluation; scores in points.
-    episodes: a row an evaluated episode; scores in points, lengths in steps and emulator frames.
-    curves: a row a value of a training's curve, with `frames` (emulator frames of training), `hours` and `flops`
+    runs: one row per run: its score in comparisons, config by dotted keys, the result's numbers, tags as `tag.NAME`.
+    evaluations: one row per evaluation; scores in points.
+    episodes: one row per evaluated episode; scores in points, lengths in steps and emulator frames.
+    curves: one row per value of a training's curve, with `frames` (emulator frames of training), `hours` and `flops`
         (floating-point operations of gradient updates) so far.
-    skipped: the folders left out: a name to the reason.
+    skipped: reasons by the names of the folders left out.
     """
 
     runs: "pd.DataFrame"
@@ -80,20 +79,18 @@ def load_runs(
     score: Literal["last", "training"] = "last",
     window: str | float = 0.2,
 ) -> Runs:
-    """Read the runs under `outputs` from their folders, including those that still go on.
+    """Read the committed data of all runs under `outputs`, including unfinished ones.
 
-    Only what is committed counts. Runs that cannot be read are left out with a warning that names them; those that
-    `resume=never` put aside are left out without one.
+    Unreadable runs are left out with a warning; runs that `resume=never` put aside are left out silently.
 
     Args:
         outputs: the folder of `paths.outputs`.
         runs: names, starts of names, patterns or a decision's name, as `compare runs=` takes them; none means all.
-        where: KEY=VALUE of configs or tags, all of which must hold, as `compare where=` takes them. A text is cut at
-            its commas.
-        points: about how many points of a long curve are read, evenly spaced, including the first and the last; None
-            means all.
-        score: what a finished training counts by, as `compare score=` takes it: the column `score` of the runs.
-        window: of score="training", the share of the steps, the last ones, as a number or a text such as "20%".
+        where: KEY=VALUE of configs or tags, all required, as `compare where=` takes them. A string is split at commas.
+        points: about how many points to read of a long curve, evenly spaced, with the first and the last; None means
+            all.
+        score: the score of a finished training, as in `compare score=`, for the column `score` of the runs.
+        window: for score="training", the last share of the steps, as a number or a string such as "20%".
 
     Raises:
         ConfigError: if there is no such folder, no run has a key of `where`, or the window is not a share.
@@ -103,7 +100,7 @@ def load_runs(
         raise ValueError(f"score={score}: should be last or training")
     end = share("window", window)
     if points is not None and points < 1:
-        raise ValueError(f"points={points}: should be at least 1, or None for all")
+        raise ValueError(f"points={points}: should be at least 1; None reads all")
     outputs = Path(outputs)
     if not (outputs / "runs").is_dir():
         raise ConfigError(f"{outputs / 'runs'}: no such folder; load_runs takes the folder of paths.outputs")
@@ -125,7 +122,7 @@ def load_runs(
 
 
 def _training_score(run: StoredRun, window: float) -> float:
-    """Return the training score, NaN with a warning if there is none."""
+    """Return the training score; NaN with a warning if there is none."""
     try:
         return score_of(run.folder, window)
     except (ValueError, OSError) as error:
@@ -138,7 +135,7 @@ def _listed(texts: str | Sequence[str]) -> list[str]:
 
 
 def _read(run: StoredRun, points: int, skipped: dict[str, str]) -> _Parts:
-    """Read a run's folder; note a later evaluation that is damaged in `skipped`. Raises: as UNREADABLE."""
+    """Read a run's folder; add later evaluations that are damaged to `skipped`. Raises: UNREADABLE errors."""
     folder, commit, result = run.folder, run.folder.commit, run.folder.final_result
     row = dict(run.config)
     if result is not None:
@@ -242,7 +239,7 @@ def _assemble(read: Sequence[_Parts], skipped: dict[str, str]) -> Runs:
 
 
 def _section(key: str) -> int:
-    """Order columns: the config, then the result and its evaluation, then the tags."""
+    """Return a column's place: config, then result and evaluation, then tags."""
     return 2 if key.startswith("tag.") else 1 if key.startswith("result.") or "/" in key else 0
 
 
@@ -253,7 +250,7 @@ def _joined(frames: Sequence["pd.DataFrame"], columns: list[str]) -> "pd.DataFra
 
 
 def _column(values: Sequence[Any]) -> list[Any]:
-    """Return values of one type, to group by and to keep in a file: lists and mixed values as JSON."""
+    """Return values of one type, to group by and to store: lists and mixed values as JSON."""
     present = [value for value in values if value is not None]
     kinds = {"number" if type(value) in (int, float) else type(value).__name__ for value in present}
     if len(kinds) <= 1 and "list" not in kinds:

@@ -1,4 +1,4 @@
-"""Read run folders; what cannot be read is named with a reason."""
+"""Read run folders; name those that cannot be read, with reasons."""
 
 import csv
 import re
@@ -28,7 +28,7 @@ from atlantis_exp.statistics import interquartile_mean
 Array = npt.NDArray[np.float64]
 
 AXES = {"frames": "equal frames", "hours": "equal hours", "flops": "equal gradient FLOPs"}
-"""The three fair views: column of a learning curve to what is equal."""
+"""The three fair views, by column of a learning curve."""
 
 _CURVE = {
     "frames": "throughput/frames",
@@ -40,7 +40,7 @@ _CURVE = {
 
 PUT_ASIDE = "put aside by resume=never"
 NOT_STARTED = "foreign: it has no config.json"
-"""Reasons for which a folder is left out that are no damage."""
+"""Reasons to leave out an undamaged folder."""
 UNREADABLE = (Fault, ValueError, KeyError, TypeError, AttributeError, OSError, OverflowError, csv.Error)
 """The errors of a damaged folder."""
 _OWN_EVALUATION = re.compile(r"evaluation/(\d{1,18})\.csv")
@@ -48,10 +48,10 @@ _OWN_EVALUATION = re.compile(r"evaluation/(\d{1,18})\.csv")
 
 @dataclass(frozen=True)
 class Evaluated:
-    """An evaluation of a run, its own or one that the verb `evaluate` made."""
+    """An evaluation of a run, by its training or by the verb `evaluate`."""
 
     folder: RunFolder  # that holds it
-    artifact: str  # its episodes
+    artifact: str  # the table of its episodes
     source: str  # training, evaluate, baseline or human
     step: int
     epsilon: float  # NaN without a network
@@ -65,7 +65,7 @@ class Evaluated:
 
 @dataclass(frozen=True)
 class Run:
-    """What runs are chosen and grouped by."""
+    """A run by its config and tags, for selecting and grouping."""
 
     name: str
     config: dict[str, Any]  # dotted keys
@@ -73,21 +73,21 @@ class Run:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Config and tags; the config wins, except that the tag `device` says which one `auto` has become."""
+        """Config and tags; the config wins, except for `device`, since the tag resolves `auto`."""
         return {**self.tags, **self.config, **{key: value for key, value in self.tags.items() if key == "device"}}
 
     @property
     def game(self) -> Component | None:
-        """The game; None for a plugin's that is not loaded."""
+        """The game; None if its plugin is not loaded."""
         return game_of(str(self.config.get("env.id")))
 
 
 @dataclass(frozen=True)
 class StoredRun(Run):
-    """A run folder, finished or not, as far as it is read to choose it."""
+    """A run folder, finished or not, read as far as selecting needs."""
 
     folder: RunFolder
-    trained: Config | None  # None of a player: a baseline, a person or exported weights
+    trained: Config | None  # None for a player: a baseline, a person or exported weights
     evaluations: list[Evaluated]  # its own by step, then those of the verb `evaluate` by age
 
 
@@ -95,19 +95,19 @@ class StoredRun(Run):
 class Training(Run):
     """A finished training, with its learning curve and its evaluation after the last step.
 
-    Its config has the epsilon of that evaluation, and those limits of a budget that ended the training.
+    Its config has that evaluation's epsilon, and the budget's limits that ended the training.
     """
 
-    science: dict[str, Any]  # the dotted keys that decide its numbers
+    science: dict[str, Any]  # the keys that decide its numbers, dotted
     curve: dict[str, Array]  # frames, hours, flops (where recorded), epsilon, score (mean of the last 100 episodes)
     episodes: EpisodeTable
-    policy: str = ""  # what the network did most in these episodes, in words; empty if not recorded
+    policy: str = ""  # the network's most frequent action, in words; empty if not recorded
     film: Path | None = None  # of one of these episodes
-    training_score: float | None = None  # which it counts by in place of the evaluation's, if it is asked for
+    training_score: float | None = None  # its score for score=training
 
     @property
     def score(self) -> float:
-        """What it counts by."""
+        """The score that it counts by."""
         return interquartile_mean(self.episodes.scores) if self.training_score is None else self.training_score
 
     @property
@@ -118,7 +118,7 @@ class Training(Run):
 
 @dataclass(frozen=True)
 class Player(Run):
-    """A baseline, a person or exported weights: not trained here."""
+    """A baseline, a person or exported weights, not trained here."""
 
     episodes: EpisodeTable
     film: Path | None = None  # of one of these episodes
@@ -137,16 +137,16 @@ class Player(Run):
 
 @dataclass
 class Stored:
-    """The runs of an outputs folder, and those left out: a folder's name to the reason."""
+    """The runs of an outputs folder, and reasons by the names of those left out."""
 
     runs: list[StoredRun] = field(default_factory=list)
-    exported: list[StoredRun] = field(default_factory=list)  # weights, by their latest evaluation at each epsilon
+    exported: list[StoredRun] = field(default_factory=list)  # weights, one for the latest evaluation at each epsilon
     skipped: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass
 class Gathered:
-    """The finished runs of an outputs folder, and those left out: a folder's name to the reason."""
+    """The finished runs of an outputs folder, and reasons by the names of those left out."""
 
     trainings: list[Training] = field(default_factory=list)
     players: list[Player] = field(default_factory=list)
@@ -155,14 +155,14 @@ class Gathered:
 
 
 class _Unusable(ValueError):
-    """Why a sound folder cannot be used."""
+    """The reason why an undamaged folder cannot be used."""
 
 
 def read_runs(outputs: Path, runs: Sequence[str] = (), put_aside: bool = False) -> Stored:
     """Read configs, tags and evaluations of all runs under `outputs`, without their episodes and curves.
 
     Args:
-        runs: names, starts of names, patterns or a decision's name; empty for all. Players are read in any case.
+        runs: names, starts of names, patterns or a decision's name; empty for all. Players are always read.
         put_aside: whether to read runs that resume=never put aside.
     """
     patterns, stored = named_by(outputs, runs), Stored()
@@ -201,7 +201,7 @@ def _open(folder: RunFolder, tree: dict[str, Any], later: Sequence[Evaluated]) -
 
 
 def _evaluations(outputs: Path, stored: Stored) -> dict[str, list[Evaluated]]:
-    """Return the finished runs of the verb `evaluate` by the run they evaluate, by age; put exported weights aside."""
+    """Return the finished evaluations by run, the oldest first; add those of exported weights to `stored`."""
     found: list[tuple[int, dict[str, Any], Evaluated]] = []
     for path in sorted((outputs / "evaluations").glob(f"*/{RESULT}")):
         folder = RunFolder(path.parent)
@@ -237,8 +237,8 @@ def _reason(error: Exception) -> str:
 def gather(outputs: Path, runs: Sequence[str] = (), epsilon: float | None = None, put_aside: bool = False) -> Gathered:
     """Read all finished trainings and players under `outputs`; `runs` and `put_aside` as for `read_runs`.
 
-    A training's episodes are those of its latest evaluation after its last step, its own or one that the verb
-    `evaluate` made; given `epsilon`, of the latest at that epsilon.
+    A training's episodes are those of the latest evaluation after its last step, by itself or by the verb `evaluate`;
+    given `epsilon`, of the latest one at that epsilon.
     """
     stored, patterns = read_runs(outputs, runs, put_aside), named_by(outputs, runs)
     gathered = Gathered(skipped=stored.skipped)
@@ -262,7 +262,7 @@ def _training(run: StoredRun, config: Config, epsilon: float | None) -> Training
         state = f"failed: {folder.error}" if folder.state == "failed" else "unfinished"
         raise _Unusable(f"{state}: the command that started it continues it")
     if (result := folder.ended(config.budget.limits)) is None:
-        raise _Unusable("unfinished: it was made longer; the command that did so continues it")
+        raise _Unusable("unfinished: its limits were raised; the command that raised them continues it")
     at_end = [each for each in run.evaluations if each.step == result.steps and each.path.exists()]
     if not (taken := [each for each in at_end if epsilon in (None, each.epsilon)]):
         wanted = "" if epsilon is None else f" at epsilon {epsilon}"
@@ -310,13 +310,13 @@ def _episodes(evaluated: Evaluated, game: Game) -> EpisodeTable:
 
 
 def is_of_another(evaluation: RunFolder, run: RunFolder) -> bool:
-    """Return whether an evaluation is older than the run: of an earlier one of that name, which was put aside."""
+    """Return whether an evaluation is older than the run: it belongs to one of that name that was put aside."""
     made, begun = evaluation.commit, run.commit
     return made is not None and begun is not None and made.updated < begun.started
 
 
 def named_by(outputs: Path, runs: Iterable[str]) -> list[str]:
-    """Return the names, starts of names and patterns of `runs`, a decision's name replaced by those of its runs.
+    """Return `runs` with each decision's name replaced by the names of its runs.
 
     Raises: Fault if a decision's folder is damaged.
     """
@@ -330,9 +330,9 @@ def named_by(outputs: Path, runs: Iterable[str]) -> list[str]:
 
 
 def fits(name: str, patterns: Sequence[str]) -> bool:
-    """Return whether a run's name starts with or matches one of the patterns; true without any.
+    """Return whether a run's name starts with or matches one of the patterns, or there are none.
 
-    A pattern that ends with a seed is not the start of a longer one: `cnn-uniform-s1` does not match s10.
+    A pattern that ends in a seed matches only that seed: `cnn-uniform-s1` does not match s10.
     """
     rests = ("[!0-9]*" if re.search(r"s\d+$", pattern) else "*" for pattern in patterns)
     return not patterns or any(
@@ -342,7 +342,7 @@ def fits(name: str, patterns: Sequence[str]) -> bool:
 
 
 def refuse_unknown(outputs: Path, runs: Iterable[str]) -> None:
-    """Raise ConfigError for a text of `runs` that no run matches."""
+    """Raise ConfigError for an item of `runs` that matches no run."""
     names = [path.name for path in (outputs / "runs").glob("*") if path.is_dir()]
     for text in runs if names else ():
         patterns = named_by(outputs, [text])

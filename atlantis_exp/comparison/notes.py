@@ -1,4 +1,4 @@
-"""Say what a reader must know before believing a comparison: a function a subject, which yields its lines or none."""
+"""Write the caveats and notes of a comparison: one function per subject, which yields its lines, if any."""
 
 import json
 from collections import defaultdict
@@ -32,7 +32,7 @@ _SHARES = {"frames": "{:,.0f} frames", "hours": "{:.2f} hours", "flops": "{:.3g}
 
 @dataclass(frozen=True)
 class Facts:
-    """All that a note may be about."""
+    """The input of all notes."""
 
     game: Component | None
     groups: Mapping[str, Sequence[Training]]
@@ -42,7 +42,7 @@ class Facts:
     answers: Sequence[Answer]
     tables: Mapping[str, Table]
     frames: float  # of the longest training
-    account: Sequence[str] = ()  # what other questions about the runs mean for this one
+    account: Sequence[str] = ()  # remarks on other questions about the runs
 
     @property
     def by(self) -> Sequence[str]:
@@ -59,7 +59,7 @@ Note = Callable[[Facts], Iterator[str]]
 
 
 def stands(facts: Facts) -> Iterator[str]:
-    """Say what each answer rests on: score, looks, seeds, error, length of training, and other questions."""
+    """Yield the basis of each answer: score, looks, seeds, error, length of training, and other questions."""
     if facts.question.score == "training":
         yield f"The score is {measure(facts.question)}."
     length = f"; trained for up to {facts.frames:,.0f} frames" if facts.frames else ""
@@ -69,7 +69,7 @@ def stands(facts: Facts) -> Iterator[str]:
 
 
 def further_answers(facts: Facts) -> Iterator[str]:
-    """Say which groups may be best, and of a few pairs how often a seed wins, and what remains possible."""
+    """Yield the groups that may be best; for a few pairs, how often a seed wins, and what remains possible."""
     for answer in facts.answers:
         plan, best = answer.family.plan, may_be_best(answer.decision)
         if plan.baseline is None and 1 < len(best) < len(answer.family.seeds):
@@ -86,7 +86,7 @@ def further_answers(facts: Facts) -> Iterator[str]:
             base = fmean(seeds[plan.baseline] if plan.baseline else map(fmean, seeds.values()))
             delta = (plan.delta or 0.0) * (abs(base) if plan.relative else 1)
             said += [
-                f"{of.group} is no worse by more than {margin(plan)}"
+                f"{of.group} is at most {margin(plan)} worse"
                 for of in (verdict, verdict.turned)
                 if delta and of.low > -delta
             ]
@@ -97,16 +97,16 @@ def further_answers(facts: Facts) -> Iterator[str]:
 
 
 def conditions(facts: Facts) -> Iterator[str]:
-    """Say how much a look overstates each difference, and which collapse would undo its verdict."""
+    """Yield how much a look overstates each difference, and which collapse would undo its verdict."""
     for answer, look, verdict in _looked_at(facts):
         if verdict.said in ("better", "worse"):
             one, other = verdict.leading.group, verdict.leading.other
             found = condition(verdict, look, answer.family.seeds)
             yield (
-                f"{one} against {other}: a look overstates what it finds; the true difference is rather "
-                f"{abs(size_found(verdict, look)):,.0f} points. The verdict assumes seeds that vary alike (here "
-                f"{found.spreads:.1f} times as much in one group); it would not hold if {found.undone_by:.0%} of the "
-                f"seeds of {one} collapsed, and {verdict.seeds} seeds leave up to {found.unseen:.0%} possible."
+                f"{one} against {other}: a look overstates the difference that it finds; the true one is rather "
+                f"{abs(size_found(verdict, look)):,.0f} points. The verdict assumes that seeds vary alike (here "
+                f"{found.spreads:.1f} times as much in one group). It would not hold if {found.undone_by:.0%} of the "
+                f"seeds of {one} collapsed; {verdict.seeds} seeds cannot exclude up to {found.unseen:.0%}."
             )
 
 
@@ -120,23 +120,23 @@ def _looked_at(facts: Facts) -> Iterator[tuple[Answer, Look, Verdict]]:
 
 
 def unusual_runs(facts: Facts) -> Iterator[str]:
-    """Name runs whose policy, replay memory or code makes their scores mean less, and those that play alike."""
+    """Name runs whose policy, replay memory or code makes scores less meaningful, and runs that play alike."""
     for label, runs in facts.groups.items():
         if names := [run.name for run in runs if run.has_collapsed]:
             yield (
-                f"{len(names)} of {len(runs)} runs of {label} collapsed to one action, so their scores say little of "
-                f"learning: {listed(names)}."
+                f"{len(names)} of {len(runs)} runs of {label} collapsed to one action, so their scores say little "
+                f"about learning: {listed(names)}."
             )
     if alike := [f"{row['run']} as {row['same_as']}" for row in facts.tables["runs"] if row["same_as"]]:
         yield f"The same score in every episode: {listed(alike)}."
     if names := [run.name for run in facts.trainings if LOST in run.tags]:
-        yield f"Went on without a part of their replay memory, which was damaged: {listed(names)}."
+        yield f"Continued without a damaged part of their replay memory: {listed(names)}."
     if COMMIT in facts.by and (names := [run.name for run in facts.trainings if run.tags.get("git.dirty") == "true"]):
-        yield f"Made with changes that their commit does not hold: {listed(names)}."
+        yield f"Made with uncommitted changes: {listed(names)}."
 
 
 def missing_seeds(facts: Facts) -> Iterator[str]:
-    """Name seeds that a group lacks: unfinished or damaged, or left out, perhaps for their scores."""
+    """Name the seeds that a group lacks: unfinished, damaged, or left out, perhaps for their scores."""
     seeds = {label: {run.config["seed"] for run in runs} for label, runs in facts.groups.items()}
     names = defaultdict(list)
     for run in facts.lost:
@@ -146,17 +146,17 @@ def missing_seeds(facts: Facts) -> Iterator[str]:
     for label, missing in names.items():
         yield (
             f"{label} lacks {len(missing)} {'seed' if len(missing) == 1 else 'seeds'}, unfinished or unusable: "
-            f"{listed(missing)}. If how it played is the reason, the others do not stand for it."
+            f"{listed(missing)}. If scores are the reason, the other seeds are not representative."
         )
     for label, left_out in seeds_between(seeds, {run.config["seed"] for run in facts.lost}).items():
         yield (
-            f"{label} goes without seed {listed([*map(str, left_out)])}, which others have. If its score is the "
+            f"{label} lacks seed {listed([*map(str, left_out)])}, which others have. If its score is the "
             "reason, the error does not hold."
         )
 
 
 def modes_found(facts: Facts) -> Iterator[str]:
-    """Describe seeds that fall into two modes: their mean is the score of neither."""
+    """Describe seeds that fall into two modes, whose mean is the score of neither."""
     played = {row["group"]: row for row in facts.tables["evaluation"]}
     for group in facts.scored:
         if (found := modes(list(group.seeds.values()))) is not None:
@@ -172,7 +172,7 @@ def modes_found(facts: Facts) -> Iterator[str]:
 
 
 def unlike(facts: Facts) -> Iterator[str]:
-    """Name differences between runs that their identity leaves out; a tag that some lack may differ there."""
+    """Name differences between runs that their identity ignores; a missing tag counts as a difference."""
     subjects: dict[str, Callable[[Training], str]] = {
         "made in different precisions": lambda run: run.tags.get("precision", "not recorded"),
         "made on different devices": lambda run: run.tags.get("device", "not recorded"),
@@ -190,14 +190,14 @@ def unlike(facts: Facts) -> Iterator[str]:
 
 
 def _ended_by(run: Training) -> str:
-    """Return what ended a training, as a user writes it."""
+    """Return the limits that ended a training, as a user writes them."""
     steps, flops = run.config["budget.steps"], run.config.get("budget.flops")
     limits = [f"budget.steps={steps:,}"] if steps else []
     return " ".join([*limits, f"budget.flops={flops:g}"] if flops else limits) or "the whole plan"
 
 
 def unbalanced(facts: Facts) -> Iterator[str]:
-    """Name groups and seeds that an average leaves out, and keys that are not answered by themselves."""
+    """Name groups and seeds that an average leaves out, and keys without an answer of their own."""
     for answer in facts.answers:
         family = answer.family
         if family.left_out:
@@ -206,7 +206,7 @@ def unbalanced(facts: Facts) -> Iterator[str]:
         for value, members in family.groups.items():
             if members and (alone := set.union(*(set(group.seeds) for group in members)) - family.seeds[value].keys()):
                 seeds = listed([*map(str, sorted(alone))])
-                yield f"By {family.name}, {value} goes without seed {seeds}, which not all of its groups have."
+                yield f"By {family.name}, {value} is averaged without seed {seeds}, which not all of its groups have."
     names = [answer.family.name for answer in facts.answers]
     if facts.answers and "," in names[-1]:
         for key in set(names[-1].split(",")) - set(names):
@@ -214,7 +214,7 @@ def unbalanced(facts: Facts) -> Iterator[str]:
 
 
 def moved_seeds(facts: Facts) -> Iterator[str]:
-    """Name groups with more seeds than the look of a verdict, and pairs whose seeds at a look are gone or changed."""
+    """Name groups with more seeds than their verdict's look, and pairs whose seeds have changed since a look."""
     late: dict[str, int] = {}
     for answer in facts.answers:
         for verdict in answer.decision.verdicts:
@@ -223,7 +223,7 @@ def moved_seeds(facts: Facts) -> Iterator[str]:
                     late[value] = there
     if late:
         yield (
-            "Verdicts rest on the seeds of their looks, scores are of all seeds there are: "
+            "Verdicts use the seeds of their looks, scores all existing seeds: "
             f"{listed([f'{value} has {seeds}' for value, seeds in late.items()])}."
         )
     for answer in facts.answers:
@@ -238,8 +238,8 @@ def moved_seeds(facts: Facts) -> Iterator[str]:
                 moved[f"{verdict.group} against {verdict.other}"] = not isclose(now, verdict.difference, abs_tol=1e-6)
         if pairs := [pair for pair, is_so in moved.items() if is_so]:
             yield (
-                f"By {answer.family.name}, runs of past looks are gone or have other scores now, and their verdicts "
-                f"stay: {listed(pairs)}."
+                f"By {answer.family.name}, runs of past looks are gone or have new scores, but their verdicts stay: "
+                f"{listed(pairs)}."
             )
 
 
@@ -248,7 +248,7 @@ def mixed(facts: Facts) -> Iterator[str]:
     varied = {label: _differing([run.science for run in runs]) for label, runs in facts.groups.items()}
     for label, keys in varied.items():
         if keys := {key: values for key, values in keys.items() if key != "seed"}:
-            yield f"{label} mixes runs that differ in more than their seed: {_values(keys)}; by= can tell them apart."
+            yield f"{label} mixes runs that differ in more than their seed: {_values(keys)}; by= can separate them."
     within = {key for keys in varied.values() for key in keys}
     firsts = [runs[0] for runs in facts.groups.values()]
     asked = {resolve(key, run.config) for key in facts.by for run in firsts}
@@ -262,7 +262,7 @@ def mixed(facts: Facts) -> Iterator[str]:
 
 
 def shares(facts: Facts) -> Iterator[str]:
-    """Say which limit ended all runs, and what a run took on average."""
+    """Yield the limit that ended all runs, and the mean cost of a run."""
     ended = {*map(_ended_by, facts.trainings)}
     if len(ended) != 1 or len(facts.groups) < 2:
         return
@@ -278,7 +278,7 @@ def begun(facts: Facts) -> Iterator[str]:
     """Name the weights that trainings began with."""
     for label, runs in facts.groups.items():
         if weights := dict.fromkeys(str(run.config[key]) for run in runs if run.config.get(key := "training.weights")):
-            yield f"{label} began with {listed([*weights])}; what that took counts in no frames, hours or arithmetic."
+            yield f"{label} began with {listed([*weights])}; frames, hours and FLOPs do not include their training."
 
 
 def survival_and_rate(facts: Facts) -> Iterator[str]:
@@ -292,7 +292,7 @@ def survival_and_rate(facts: Facts) -> Iterator[str]:
     survival = (frames - other_frames) * (rate + other_rate) / 2 / 1_000
     pace = (rate - other_rate) * (frames + other_frames) / 2 / 1_000
     yield (
-        f"The mean of {one['group']} less that of {other['group']} is {one['mean'] - other['mean']:+,.0f} points: "
+        f"The mean of {one['group']} minus that of {other['group']} is {one['mean'] - other['mean']:+,.0f} points: "
         f"{survival:+,.0f} by survival ({frames:,.0f} against {other_frames:,.0f} frames an episode) and "
         f"{pace:+,.0f} by rate ({rate:,.0f} against {other_rate:,.0f} points per 1,000 frames). This describes the "
         f"episodes; it is not a verdict."
@@ -308,7 +308,7 @@ def time_cap(facts: Facts) -> Iterator[str]:
 
 
 def other_players(facts: Facts) -> Iterator[str]:
-    """Name players of the same game, say where the random one's score is from, and why early scores are below it."""
+    """Name players of the same game, the source of the random player's score, and why early scores are below it."""
     references = facts.tables["references"]
     if players := [row for row in references if row["name"].endswith(", measured")]:
         scores = [f"{row['name'].removesuffix(', measured')} {row['score']:,.0f}" for row in players]
@@ -317,21 +317,21 @@ def other_players(facts: Facts) -> Iterator[str]:
         return
     if random["protocol"].startswith("published"):
         yield (
-            "No random player was measured under these settings, so a published one takes its place; "
+            "No random player was measured under these settings, so a published score stands in; "
             f"{PROGRAM} baseline with the same env measures one."
         )
     game, is_below = facts_of(facts.game), any(row["mean"] < random["score"] for row in facts.tables["evaluation"])
     if is_below and facts.frames <= game.early_frames:
-        yield f"Scores below the random player's are normal so early: {game.early_scores}."
+        yield f"Scores below the random player's are normal this early: {game.early_scores}."
 
 
 CAVEATS: Sequence[Note] = (
     *(stands, further_answers, conditions, unusual_runs, missing_seeds, modes_found, unlike, unbalanced, moved_seeds),
 )
-"""What may make a verdict mean something else."""
+"""The notes that may change the meaning of a verdict."""
 
 NOTES: Sequence[Note] = (shares, mixed, begun, survival_and_rate, time_cap, other_players)
-"""What is said after it."""
+"""The other notes."""
 
 
 def _values(keys: Mapping[str, Sequence[str]]) -> str:

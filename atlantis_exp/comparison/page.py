@@ -1,4 +1,4 @@
-"""Write a comparison as a page: one HTML file that needs no other; and say how its tables are shown."""
+"""Write a comparison as a self-contained HTML page, and define how its tables are shown."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -13,7 +13,7 @@ from atlantis_exp.comparison.words import points
 
 
 def page(comparison: Comparison, figures: Mapping[str, Drawn], facts: Mapping[str, str]) -> str:
-    """Return the HTML page; `facts` say how and when it was made. Everything from data is escaped."""
+    """Return the HTML page, with all data escaped; `facts` say how and when it was made."""
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
     template = environment.from_string((files("atlantis_exp.comparison") / "page.html").read_text("utf-8"))
     return template.render(
@@ -79,23 +79,23 @@ _TITLE = {
     "name": "player",
     "reason": "why it is left out",
 }
-"""The titles of columns, in a table or in all, where the column's name is not its title."""
+"""The titles of columns, in one table or in all, that differ from their names."""
 
 SHARES = {
     *("time_cap_share", "truncated_share", "random_share", "share", "probability", "network", "random"),
     *("human_normalised_mean", "error", "spent"),
 }
-"""The columns that are shares and probabilities, from 0 to 1."""
+"""The columns with shares and probabilities, from 0 to 1."""
 _ENDS = {
     ("scores", "score"): ("low", "high"),
     ("scores", "difference"): ("difference_low", "difference_high"),
     **{(table, "difference"): ("low", "high") for table in ("verdict", "looks", "views")},
 }
-"""The columns of a table that have an interval, and those of its ends."""
+"""The columns with an interval, and the columns of its ends."""
 
 
 def label(name: str, column: str, score: str = "") -> str:
-    """Return the title of a column; score: the question's, for columns of it."""
+    """Return the title of a column; `score` is the question's."""
     if column == "score" and name in ("scores", "runs"):
         return _SCORE.get(score, column)
     return (
@@ -106,9 +106,9 @@ def label(name: str, column: str, score: str = "") -> str:
 
 
 def shown_columns(name: str, table: Table) -> list[str]:
-    """Return the columns that are shown: no differences without a baseline, no family if there is one.
+    """Return the columns to show: differences only with a baseline, the family only if there are several.
 
-    `why` has further ones: the sources of points in the game. A table that is not the page's has all but the ends of
+    `why` also shows the game's sources of points. A table that is not on the page shows all columns except the ends of
     intervals, which are written with their values.
     """
     keys = [*dict.fromkeys(key for row in table for key in row)]
@@ -122,7 +122,7 @@ def shown_columns(name: str, table: Table) -> list[str]:
 
 
 def cells(name: str, row: Row, columns: Sequence[str]) -> list[tuple[str, bool]]:
-    """Return a row's columns as texts with intervals, and whether each is a number."""
+    """Return a row's cells as texts with intervals, and whether each is a number."""
     texts = []
     for column in columns:
         text, ends = number(row.get(column), column), _ENDS.get((name, column), (f"{column}_low", f"{column}_high"))
@@ -133,7 +133,7 @@ def cells(name: str, row: Row, columns: Sequence[str]) -> list[tuple[str, bool]]
 
 
 def number(value: object, column: str = "") -> str:
-    """Return a table's value as a person reads it."""
+    """Format a table's value for people."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if value is None or value != value:

@@ -13,9 +13,9 @@ Table = list[Row]
 
 
 def scores(game: Component | None) -> Table:
-    """Return the published scores of players and algorithms; none for a game without.
+    """Return the published scores of players and algorithms, if any.
 
-    Points per frame are as if all frames that the cap allows were played: the least that the rate can be.
+    Points per frame assume that episodes reach the time cap, so they are lower bounds.
     """
     facts = facts_of(game)
     of = {"points_per_frame": nan, "kind": "player", "protocol": "published, no-op starts"}
@@ -29,7 +29,7 @@ def scores(game: Component | None) -> Table:
 
 
 def curves(game: Component | None) -> Table:
-    """Return the published learning curves; none for a game without."""
+    """Return the published learning curves, if any."""
     return [{**row, "frames": 1e6 * float(row.pop("frames_millions"))} for row in _read(game, "curves.csv")]
 
 
@@ -44,5 +44,5 @@ def _read(game: Component | None, name: str) -> Table:
 
 
 def random_line(references: Table) -> Row | None:
-    """Return the random player measured under the runs' own settings, else the published one, if any."""
+    """Return the random player measured under the runs' settings, or else the published one, if any."""
     return next((row for row in references if row["name"].startswith("random")), None)

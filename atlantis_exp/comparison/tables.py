@@ -1,4 +1,4 @@
-"""Compute the tables and answers of a comparison: every number on the page or in a figure is in one of the tables."""
+"""Compute the tables and answers of a comparison; they have every number on the page and in the figures."""
 
 import csv
 import io
@@ -36,21 +36,21 @@ _NAN = float("nan")
 class Comparison:
     """A comparison of groups of runs, as it is printed and drawn."""
 
-    title: str  # of the game; empty if it is not known
+    title: str  # of the game; empty if unknown
     game: Game
     groups: list[str]
     by: list[str]
     question: Question
-    measure: str  # what a seed's score is
+    measure: str  # definition of a seed's score
     answers: list[Answer]
     verdict: str  # the answer by the first key
     others: list[str]  # the answers by the other keys
-    caveats: list[str]  # what may make the verdict mean something else
+    caveats: list[str]  # may change the meaning of the verdict
     notes: list[str]
     tables: dict[str, Table]
 
     def document(self, verb: Literal["compare", "decide"]) -> documents.Compared:
-        """Return what is known, for programs."""
+        """Return the comparison as a JSON document."""
         seeds: dict[tuple[str, str], dict[int, float]] = defaultdict(dict)
         for row in self.tables["seeds"]:
             seeds[row["family"], row["group"]][row["seed"]] = row["score"]
@@ -89,12 +89,12 @@ def compare(
     now: bool = False,
     scored: Sequence[Group] = (),
 ) -> Comparison:
-    """Compare groups of trainings, taking the looks that are due, or with `now` one that is not.
+    """Compare groups of trainings and take the looks that are due, or with `now` an unplanned one.
 
-    account: the looks taken before, and the error that is left.
+    account: earlier looks, and the error left.
     scored: the groups with the scores of their seeds; by default those of the trainings.
 
-    Raises: ConfigError if the baseline is not among what is compared.
+    Raises: ConfigError if the baseline is not one of the groups.
     """
     account = account or Account()
     seeds_of = scored or [group_of(runs, question.by) for runs in groups.values()]
@@ -151,7 +151,7 @@ def compare(
 
 
 def to_csv(table: Table) -> str:
-    """Write a table with the keys of its rows as header; an empty one is an empty text."""
+    """Write a table as CSV; an empty table gives an empty text."""
     text = io.StringIO()
     if table:
         writer = csv.DictWriter(text, dict.fromkeys(key for row in table for key in row), lineterminator="\n")
@@ -161,7 +161,7 @@ def to_csv(table: Table) -> str:
 
 
 def _table(**columns: npt.ArrayLike) -> Table:
-    """Return the rows of columns; a single value is that of every row."""
+    """Turn columns into rows; a scalar repeats in every row."""
     values = (column.tolist() for column in np.broadcast_arrays(*columns.values()))
     return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
 
@@ -179,7 +179,7 @@ def _sentences(answers: Sequence[Answer], groups: Sequence[str], question: Quest
 
 
 def _scores(family: str, values: Mapping[str, Mapping[int, float]], answer: Answer | None) -> Table:
-    """Return the score of each value of a family, with the difference to the baseline if there is one."""
+    """Return the score of each value of a family, and its difference from the baseline, if any."""
     baseline = answer.family.plan.baseline if answer else None
     found = {verdict.group: verdict for verdict in answer.decision.verdicts} if answer and baseline else {}
     table = []
@@ -205,7 +205,7 @@ def _scores(family: str, values: Mapping[str, Mapping[int, float]], answer: Answ
 
 
 def _mean_interval(seeds: Sequence[float] | Array) -> tuple[float, float]:
-    """Return Student's interval; NaN for fewer than `FEWEST_SEEDS` seeds, for which it cannot be trusted."""
+    """Return Student's interval; NaN for fewer than `FEWEST_SEEDS` seeds, where it is not reliable."""
     return mean_interval(seeds) if len(seeds) >= FEWEST_SEEDS else (_NAN, _NAN)
 
 
@@ -234,7 +234,7 @@ def _looks(answer: Answer) -> Table:
 
 
 def _pooled(runs: Sequence[Training], column: str = "scores") -> Scores:
-    """Return a column of all episodes of some runs."""
+    """Return one column of all episodes of some runs."""
     return np.concatenate([getattr(training.episodes, column) for training in runs])
 
 
@@ -253,9 +253,9 @@ def _evaluation(label: str, runs: Sequence[Training], game: Game) -> Row:
 
 
 def _why(label: str, runs: Sequence[Training], sources: Sequence[str]) -> Row:
-    """Split a group's mean score into mean frames an episode times rate, and the rate into its sources.
+    """Split a group's mean score into frames per episode times rate, and the rate into its sources.
 
-    The rate is in points per 1,000 emulator frames. The parts sum to it; they are NaN if an episode lacks them.
+    The rate is in points per 1,000 emulator frames. Its parts sum to it; they are NaN if an episode lacks them.
     """
     frames = _pooled(runs, "frames")
     thousands = frames.sum() / 1_000 or _NAN
@@ -270,7 +270,7 @@ def _why(label: str, runs: Sequence[Training], sources: Sequence[str]) -> Row:
 
 
 def _runs(groups: Groups) -> Table:
-    first: dict[bytes, str] = {}  # run with these scores, in the order of the episodes
+    first: dict[bytes, str] = {}  # run by its scores, in the order of episodes
     table = []
     for label, training in ((label, training) for label, runs in groups.items() for training in runs):
         summary = summarize(training.episodes.scores)
@@ -296,7 +296,7 @@ def _runs(groups: Groups) -> Table:
 
 
 def _curve(axis: str, label: str, runs: Sequence[Training]) -> Table:
-    """Return the mean over seeds as far as all runs go, with its interval if there are enough seeds."""
+    """Return the mean over seeds up to the shortest run, with an interval if there are enough seeds."""
     if (grid := _grid(axis, runs)) is None:
         return []
     seeds = np.array([*one_a_seed(runs, partial(_at, axis=axis, x=grid)).values()])
@@ -306,7 +306,7 @@ def _curve(axis: str, label: str, runs: Sequence[Training]) -> Table:
 
 
 def _seed_curves(axis: str, label: str, runs: Sequence[Training]) -> Table:
-    """Return the curves of a group's runs if they are several, and too few for an interval."""
+    """Return the single curves of a group with several runs but too few for an interval."""
     seeds = {training.config["seed"] for training in runs}
     if len(runs) == 1 or len(seeds) >= FEWEST_SEEDS or (grid := _grid(axis, runs)) is None:
         return []
@@ -315,7 +315,7 @@ def _seed_curves(axis: str, label: str, runs: Sequence[Training]) -> Table:
 
 
 def _grid(axis: str, runs: Sequence[Training]) -> Array | None:
-    """Return places at which all runs have a curve; None if they share none."""
+    """Return points at which all runs have a curve; None if there are none."""
     if not all(axis in training.curve for training in runs):
         return None
     first = max(training.curve[axis][0] for training in runs)
@@ -328,7 +328,7 @@ def _at(training: Training, axis: str, x: float | Array, measure: str = "score")
 
 
 def _profile(groups: Groups, game: Game) -> Table:
-    """Return the share of episodes that score more than tau (Agarwal et al. 2021), for tau over all scores."""
+    """Return the share of episodes above tau (Agarwal et al. 2021), for tau over the range of scores."""
     if not groups:
         return []
     scores = np.concatenate([_pooled(runs) for runs in groups.values()])
@@ -367,9 +367,9 @@ def _measured(player: Player) -> Row:
 
 
 def _views(groups: Groups) -> Table:
-    """Compare the leader in each of the three fair views with each other group, where the shortest run ends.
+    """Compare the leader in each of the three fair views with the other groups, where the shortest run ends.
 
-    No look is spent on these descriptions. The intervals are those of one look at all pairs, whichever group leads.
+    These descriptions spend no look. Their intervals are those of one look at all pairs, whichever group leads.
     """
     table: Table = []
     trainings = [training for runs in groups.values() for training in runs]
@@ -403,8 +403,8 @@ def _views(groups: Groups) -> Table:
 def _at_once(values: Mapping[str, Mapping[int, float]]) -> dict[tuple[str, str], Verdict]:
     """Return the verdicts of one look at all pairs with an error of 5 %, for their intervals.
 
-    There are none for fewer than `FEWEST_SEEDS` seeds, nor for unequal numbers of seeds, since they would not be about
-    the differences shown.
+    Return none for fewer than `FEWEST_SEEDS` seeds, or for unequal numbers, whose verdicts would not match the
+    differences shown.
     """
     sizes = {len(seeds) for seeds in values.values()}
     if len(sizes) > 1 or min(sizes) < FEWEST_SEEDS:

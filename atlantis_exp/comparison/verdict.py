@@ -1,6 +1,6 @@
 """Turn a question about groups of runs into families of pairs, and decide each.
 
-A seed's *score* is what `Question.score` says, a group's the mean over its seeds. Verdicts are about nothing else.
+`Question.score` defines the score of a seed. A group's score is the mean over its seeds; verdicts are about it alone.
 """
 
 from collections import defaultdict
@@ -17,7 +17,7 @@ from atlantis_exp.comparison.decision import Decision, Look, Plan, decide, looks
 from atlantis_exp.comparison.gather import Training
 from atlantis_exp.faults import ConfigError
 
-_SHORTEST_COMMIT = 4  # digits of a commit's name, as git itself wants them
+_SHORTEST_COMMIT = 4  # digits of a commit, as for git
 
 
 @dataclass(frozen=True)
@@ -25,24 +25,24 @@ class Question:
     """A question about groups, and the error that the whole answer may have."""
 
     by: Sequence[str]  # keys
-    seeds: int = 10  # a group, at the plan's last look
+    seeds: int = 10  # per group, at the plan's last look
     error: float = 0.05  # probability of any false verdict, over all families, pairs and looks
     delta: float | None = None  # a difference that does not matter
     relative: bool = False  # whether delta is a share of a score
     baseline: str | None = None  # a value of one of the keys, or a group
-    score: Literal["last", "training", "file"] = "last"  # `words.measure` says what each is
-    window: float = 0.2  # the share of the steps, the last ones, that score=training is about
+    score: Literal["last", "training", "file"] = "last"  # `words.measure` defines each
+    window: float = 0.2  # last share of the steps, for score=training
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What makes it this question; without the score if it is the evaluation's, as in comparisons before others."""
+        """The fields that identify it; without the score if it is the default, as in older comparisons."""
         unused = {"last": {"score", "window"}, "training": set[str](), "file": {"window"}}[self.score]
         return {key: value for key, value in asdict(self).items() if key not in unused}
 
 
 @dataclass(frozen=True)
 class Group:
-    """The runs of one value for each key of `by`, one score a seed."""
+    """The runs with one value for each key of `by`, one score per seed."""
 
     values: tuple[str, ...]
     seeds: dict[int, float]
@@ -55,26 +55,26 @@ class Group:
 
 @dataclass(frozen=True)
 class Family:
-    """Values that are compared: those of one key, averaged over the groups of all others, or all groups."""
+    """Values to compare: those of one key, averaged over the groups of the other keys, or all groups."""
 
     name: str  # the key, or all keys that differ
     plan: Plan
-    seeds: dict[str, dict[int, float]]  # by value: one score a seed
-    groups: dict[str, list[Group]]  # by value: the groups that it is averaged over
+    seeds: dict[str, dict[int, float]]  # by value: one score per seed
+    groups: dict[str, list[Group]]  # by value: the groups it is averaged over
     left_out: list[str]  # labels of groups without a counterpart for every value
 
 
 @dataclass(frozen=True)
 class Answer:
-    """Where a family stands."""
+    """The state of a family."""
 
     family: Family
     decision: Decision
-    taken: Look | None  # just now
+    taken: Look | None  # in this call
 
 
 def one_a_seed(runs: Sequence[Training], value: Callable[[Training], Any]) -> dict[int, Any]:
-    """Return a value of each seed; that of several runs of one seed, which only a mixed group has, is their mean."""
+    """Return a value per seed; the mean if a seed has several runs, as only in a mixed group."""
     found = defaultdict(list)
     for run in runs:
         found[int(run.config["seed"])].append(value(run))
@@ -82,10 +82,10 @@ def one_a_seed(runs: Sequence[Training], value: Callable[[Training], Any]) -> di
 
 
 def group_of(runs: Sequence[Training], by: Sequence[str]) -> Group:
-    """Return a group with one score a seed.
+    """Return a group with one score per seed.
 
-    Seeds that play equal games, as those that collapsed alike do, count like any other: to train others in their place
-    would choose among the seeds by their scores.
+    Seeds that play identical games, such as those that collapsed alike, count like any other: replacing them would
+    select seeds by their scores.
     """
     scores = one_a_seed(runs, lambda run: run.score)
     return Group(values_in(runs[0].facts, by), {seed: float(score) for seed, score in scores.items()})
@@ -94,16 +94,16 @@ def group_of(runs: Sequence[Training], by: Sequence[str]) -> Group:
 def families(groups: Sequence[Group], question: Question) -> list[Family]:
     """Return the families of a question; none for a single group.
 
-    Each key with several values is a family. Its values are averaged over the groups of the other keys at the same
-    seed: over those groups that every value has a counterpart of, and the seeds that all of these have. If several keys
-    have several values, all groups are a family too. The question's error is divided equally among the families.
+    Each key with several values is a family. Its values are averaged, seed by seed, over the groups of the other keys:
+    only groups that exist for every value, and seeds that all of them have. If several keys have several values, all
+    groups are a family too. The families share the question's error equally.
 
-    Raises: ConfigError if the baseline is not among what is compared.
+    Raises: ConfigError if the baseline is not one of the values or groups.
     """
     keys = [index for index in range(len(question.by)) if len({group.values[index] for group in groups}) > 1]
     if not keys:
         if question.baseline is not None:
-            raise ConfigError(f"baseline={question.baseline}: there is one group only, so nothing to compare it with")
+            raise ConfigError(f"baseline={question.baseline}: there is only one group, so nothing to compare it with")
         return []
     averaged = [(question.by[index], _averaged(groups, index)) for index in keys if len(keys) > 1]
     alone = {group.label: [group] for group in groups}
@@ -114,7 +114,7 @@ def families(groups: Sequence[Group], question: Question) -> list[Family]:
 
 
 def _averaged(groups: Sequence[Group], index: int) -> dict[str, list[Group]]:
-    """Return the groups that each value of a key is averaged over; empty if none has a counterpart for every value."""
+    """Return the groups to average over, by value of a key; empty if none exists for every value."""
     by_value: dict[str, dict[tuple[str, ...], Group]] = defaultdict(dict)
     for group in groups:
         by_value[group.values[index]][group.values[:index] + group.values[index + 1 :]] = group
@@ -128,11 +128,11 @@ def _baseline(
     keys: Sequence[int],
     question: Question,
 ) -> dict[str, str]:
-    """Return the family that has the baseline, and its name there."""
+    """Return the baseline's family and its name there."""
     asked = question.baseline
     if asked is None:
         return {}
-    if len(keys) == 1:  # its groups go by their full labels
+    if len(keys) == 1:  # its groups have full labels
         (name, _), (index,) = members[0], keys
         named = {group.values[index]: group.label for group in groups} | {group.label: group.label for group in groups}
         choices = [(name, value, label) for value, label in named.items()]
@@ -169,10 +169,10 @@ def _family(
 
 
 def answer(asked: Sequence[Family], record: Mapping[str, Sequence[Look]], now: bool = False) -> list[Answer]:
-    """Take the looks that are due in each family, or with `now` one at the seeds there are.
+    """Take the looks that are due in each family, or with `now` one at the existing seeds.
 
-    Once a look has decided some pairs, the others may have the seeds of the next one already. The record has the looks
-    taken before, by family.
+    After a look decides some pairs, the others may already have the seeds for the next look. `record` has the earlier
+    looks by family.
     """
     answers = []
     for family in asked:
@@ -186,9 +186,9 @@ def answer(asked: Sequence[Family], record: Mapping[str, Sequence[Look]], now: b
 
 
 def wanted(answers: Sequence[Answer]) -> dict[str, list[int]]:
-    """Return the seeds that each group lacks for the next looks of undecided families; empty if all are decided.
+    """Return the seeds that each group lacks for the next looks; empty if all families are decided.
 
-    They are the lowest that are missing, so that contenders share their seeds.
+    They are the lowest missing ones, so that contenders share seeds.
     """
     lacking: dict[str, set[int]] = defaultdict(set)
     for family, decision in ((each.family, each.decision) for each in answers):
@@ -203,7 +203,7 @@ def wanted(answers: Sequence[Answer]) -> dict[str, list[int]]:
 
 
 def worse_than_baseline(answers: Sequence[Answer], by: Sequence[str]) -> list[str]:
-    """Say which groups are worse than the baseline and differ from it in their commit alone, and by how much."""
+    """Return the groups that differ from the baseline only in their commit and are worse, and by how much."""
     place = list(by).index(COMMIT)
 
     def split(answer: Answer, value: str) -> tuple[set[str], set[tuple[str, ...]]]:
@@ -213,7 +213,7 @@ def worse_than_baseline(answers: Sequence[Answer], by: Sequence[str]) -> list[st
 
     base = {commit for each in answers if (name := each.family.plan.baseline) for commit in split(each, name)[0]}
     lines = []
-    for each in answers:  # also a family without the baseline, as of the groups behind its average
+    for each in answers:  # also families without the baseline, such as all groups
         for of in (verdict.leading for verdict in each.decision.verdicts if verdict.said in ("better", "worse")):
             (better, rest), (worse, other_rest) = split(each, of.group), split(each, of.other)
             if better == base != worse and rest == other_rest:

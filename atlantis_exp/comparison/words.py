@@ -1,4 +1,4 @@
-"""Say a family's answer in a sentence or two, and where its looks stand."""
+"""Put a family's answer and the state of its looks into sentences."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -8,13 +8,13 @@ import numpy as np
 from atlantis_exp.comparison.decision import Plan, Verdict
 from atlantis_exp.comparison.verdict import Answer, Question
 
-IN_FULL = 3  # pairs of a family, up to which each is said with its interval
-_LISTED = 6  # undecided pairs, up to which they are named
-_NAMED = 3  # of many runs
+IN_FULL = 3  # most pairs of a family that are named with their intervals
+_LISTED = 6  # most undecided pairs that are named
+_NAMED = 3  # names out of many
 
 
 def measure(question: Question) -> str:
-    """Say what a seed's score is."""
+    """Return the definition of a seed's score."""
     match question.score:
         case "last":
             return "the interquartile mean (IQM) of the seed's evaluated episodes after its last step"
@@ -29,7 +29,7 @@ def measure(question: Question) -> str:
 
 
 def said(answer: Answer) -> str:
-    """Say what is decided and what is not; the better ones come first."""
+    """Return the decided and undecided pairs as sentences, better groups first."""
     verdicts, plan = answer.decision.verdicts, answer.family.plan
     in_full = len(verdicts) <= IN_FULL
     better: dict[tuple[str, str], list[str]] = defaultdict(list)
@@ -70,12 +70,12 @@ def _undecided(answer: Answer, verdicts: Sequence[Verdict], in_full: bool) -> st
         return f"{text}; next look at {decision.next_look} seeds{which}"
     reach = max((verdict.detectable or 0.0 for verdict in verdicts), default=0.0)
     if not reach:
-        return f"{text}, and there is no further look; the detectable difference is unknown, for seeds do not differ"
+        return f"{text}, and there is no further look; the detectable difference is unknown, since seeds do not differ"
     return f"{text}, and there is no further look; a difference of {points(reach)} would have been found with 80 %"
 
 
 def spent(answer: Answer) -> str:
-    """Say which looks were planned and taken, and the error spent."""
+    """Return the looks planned and taken, and the error spent."""
     plan, looks = answer.family.plan, answer.decision.looks
     return (
         f"looks planned at {' and '.join(map(str, plan.looks))} seeds; "
@@ -85,14 +85,14 @@ def spent(answer: Answer) -> str:
 
 
 def margin(plan: Plan) -> str:
-    """Return the plan's delta as a person writes it; empty without one."""
+    """Format the plan's delta for people; empty without one."""
     if plan.delta is None:
         return ""
     return f"{100 * plan.delta:g} %" if plan.relative else f"{points(plan.delta)} points"
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names in a row, the first three of many."""
+    """Join names, at most the first three."""
     more = len(names) - _NAMED
     return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
 
@@ -102,5 +102,5 @@ def _interval(verdict: Verdict) -> str:
 
 
 def points(value: float) -> str:
-    """Return a number as people write it."""
+    """Format a number for people."""
     return f"{value:,.0f}" if abs(value) >= 10 or value == np.round(value) else f"{value:.3g}"

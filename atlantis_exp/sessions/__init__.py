@@ -1,5 +1,5 @@
-"""The work on runs: train, sweep, search, evaluate, compare, export, publish, show.
+"""The work of the verbs: train, sweep, search, evaluate, compare, export, publish, show.
 
-In: a checked config and the user's wishes, as a `Job`. Out: run folders, lines for a person, an exit code. It knows no
-Hydra and no command line: typed words arrive as values.
+In: a checked config, for a training as a `Job`. Out: run folders, lines for a person, an exit code. It must know
+neither Hydra nor the command line.
 """

@@ -1,4 +1,4 @@
-"""Exported weights: a folder with the network's weights, their card, and a page for people."""
+"""Read and write exported weights: a folder with weights, their card, and a page for people."""
 
 import hashlib
 import json
@@ -49,7 +49,7 @@ class Card:
 
 def read_card(folder: Path) -> tuple[Card, bytes]:
     """Read a folder's card and its weights as safetensors. Raises: ConfigError, Fault for other weights."""
-    path = folder / "card.json"  # may be a link, as in a cache of downloads: a person named this folder
+    path = folder / "card.json"  # may be a link, as in a download cache: a person named this folder
     if not path.exists():
         choices = {"latest", "best", *(str(card.parent) for card in folder.parent.glob("*/card.json"))}
         has = "" if folder.parent.exists() else "; the shipped weights are in pretrained/ of the repository"
@@ -63,14 +63,14 @@ def read_card(folder: Path) -> tuple[Card, bytes]:
     except (OSError, ValueError) as error:
         raise Fault(f"{folder}: its weights cannot be read: {error}") from None
     if hashlib.sha256(weights).hexdigest() != card.sha256:
-        raise Fault(f"{folder / 'weights.safetensors'} does not have the checksum of its card")
+        raise Fault(f"{folder / 'weights.safetensors'} does not match the checksum in its card")
     return card, weights
 
 
 def write_card(
     folder: Path, shown: Path, card: Card, weights: bytes, evaluation: Evaluation, onnx: bytes | None = None
 ) -> None:
-    """Write weights, their card, the plugins that are files, and a page, which calls the folder `shown`."""
+    """Write weights, card, plugin files, and a page that calls the folder `shown`."""
     write_file(folder / "weights.safetensors", weights)
     files = f"`weights.safetensors`: {len(weights):,} bytes, {card.precision}, sha256 `{card.sha256}`."
     if onnx is not None:
@@ -96,7 +96,7 @@ def write_card(
 
 
 def pack(weights: bytes) -> tuple[bytes, Literal["float32", "float16"]]:
-    """Return weights as safetensors, in half precision if they take more than `SINGLE`."""
+    """Return weights as safetensors, in half precision if they exceed `SINGLE` bytes."""
     if len(weights) <= SINGLE:
         return weights, "float32"
     arrays = safetensors.numpy.load(weights)
@@ -105,7 +105,7 @@ def pack(weights: bytes) -> tuple[bytes, Literal["float32", "float16"]]:
 
 
 def portable(config: Config) -> Config:
-    """Return a config without the machine's processes, devices, paths and servers."""
+    """Return a config without this machine's processes, devices, paths and servers."""
     begun = config.training.pinned
     return replace(
         config,
@@ -121,7 +121,7 @@ def portable(config: Config) -> Config:
 
 
 def build_exported_actor(config: Config, weights: bytes, device: str) -> Actor:
-    """Build the player of exported weights: float32 on one thread, to round alike everywhere. Raises: Fault."""
+    """Build the player of exported weights: float32 on one thread, which rounds alike everywhere. Raises: Fault."""
     exact = replace(config, threads=1, training=replace(config.training, precision="fp32"))
     set_up_torch(exact, device)
     return build_network_actor(exact, weights, device)
@@ -138,7 +138,7 @@ def side_by_side(card: Card, settings: EvaluationConfig, scores: Sequence[float]
 
 
 def _points(settings: EvaluationConfig, scores: Sequence[float]) -> Iterator[str]:
-    """Yield the cells of `_COLUMNS`; the interval is of the mean, over episodes."""
+    """Yield the cells of `_COLUMNS`; the interval is that of the mean over episodes."""
     summary = summarize(scores)
     low, high = mean_interval(scores)
     yield f"{summary.mean:,.0f}"

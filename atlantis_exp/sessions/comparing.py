@@ -48,22 +48,22 @@ _PAGE = "comparison.html"
 
 @dataclass(frozen=True)
 class Choice:
-    """Which finished runs are compared, by which of their evaluations."""
+    """The finished runs to compare, and the evaluations to use."""
 
     outputs: Path
     runs: Sequence[str] = ()  # names, starts of names, patterns or a decision's name; none: all
     where: Sequence[str] = ()  # KEY=VALUE
     at_epsilon: float | None = None  # of the evaluations; None: each run's latest
-    scores: Path | None = None  # a table of the scores of seeds that were trained elsewhere, in place of runs
-    columns: Mapping[str, str] = field(default_factory=dict)  # of that table: group, seed or score to its name
+    scores: Path | None = None  # a table of seeds trained elsewhere, in place of runs
+    columns: Mapping[str, str] = field(default_factory=dict)  # of that table: names by group, seed and score
 
 
 def compare(
     question: Question, choice: Choice, tracking: TrackingConfig, command: str, *, look_now: bool = False
 ) -> Comparison:
-    """Compare finished runs; print the answers, and keep page, figures and tables as a run of their own.
+    """Compare finished runs, print the answers, and record page, figures and tables as a run.
 
-    The same question of more seeds is the same comparison: its folder holds the looks taken so far.
+    A question keeps its folder, with the looks taken so far, as seeds are added.
 
     Raises: ConfigError if there is nothing to compare, the runs' protocols differ, or no group is the baseline.
     """
@@ -114,13 +114,13 @@ def compare(
 
 
 def refuse_worse_commits(comparison: Comparison, baseline: str | None) -> None:
-    """Raise Fault if commits were compared with a baseline and another one is worse."""
+    """Raise Fault if a commit is worse than the baseline that it was compared with."""
     if COMMIT in comparison.by and (worse := worse_than_baseline(comparison.answers, comparison.by)):
         raise Fault(f"worse than the baseline {baseline}: {'; '.join(worse)}")
 
 
 def _gather(choice: Choice, put_aside: bool) -> Gathered:
-    """Read the chosen runs, and say which are left out. Raises: ConfigError, if there are none."""
+    """Read the chosen runs; warn of those left out. Raises: ConfigError if none is left."""
     refuse_unknown(choice.outputs, choice.runs)
     with terminal.working(f"reading the runs under {choice.outputs}"):
         gathered = gather(choice.outputs, choice.runs, choice.at_epsilon, put_aside)
@@ -129,20 +129,20 @@ def _gather(choice: Choice, put_aside: bool) -> Gathered:
     if not (trainings := select(gathered.trainings, choice.where)):
         found = len(gathered.trainings)
         none = f": none of {found} has where={','.join(choice.where)}" if found else ""
-        raise ConfigError(f"there is no finished training under {choice.outputs / 'runs'} to compare{none}")
+        raise ConfigError(f"no finished training under {choice.outputs / 'runs'} to compare{none}")
     lost = [run for run in gathered.lost if is_where(run, choice.where)]
     return replace(gathered, trainings=trainings, lost=lost)
 
 
 def _recipes(runs: Sequence[Training]) -> list[str]:
-    """Digest what a group's runs are except for their seeds: their science, their length and their evaluation.
+    """Hash a group's runs without their seeds: science, length and evaluation.
 
-    A key that differs between seeds, but not between runs of one seed, may follow from the seed and is left out: with
-    evaluation.seed=${seed} each further seed would otherwise make another comparison, without the looks taken before.
+    Leave out keys that may follow from the seed: they differ between seeds, but not between runs of one seed. With
+    evaluation.seed=${seed} each new seed would otherwise begin another comparison and lose the looks taken.
     """
     recipes = [run.science | {key: run.config[key] for key in ("budget.steps", "evaluation.epsilon")} for run in runs]
     for recipe, run in zip(recipes, runs, strict=True):
-        if (flops := run.config.get("budget.flops")) is not None:  # else an older comparison stays itself
+        if (flops := run.config.get("budget.flops")) is not None:  # older comparisons lack the key
             recipe["budget.flops"] = flops
     seeds = {run.config["seed"] for run in runs}
 
@@ -157,7 +157,7 @@ def _recipes(runs: Sequence[Training]) -> list[str]:
 def _write(
     journal: Journal, comparison: Comparison, figures: Mapping[str, Drawn], made: Mapping[str, str], compared: str
 ) -> None:
-    """Write the page, its figures and tables, and what MLflow shows."""
+    """Write the page, figures and tables, and the note and metrics for MLflow."""
     shown = {
         "command": made["command"],
         "made": strftime("%Y-%m-%d %H:%M %Z"),
@@ -176,7 +176,7 @@ def _write(
 
 
 def _metrics(comparison: Comparison) -> dict[str, float]:
-    """Return each pair's difference, and whether it is decided, under names in MLflow's alphabet."""
+    """Return each pair's difference, and whether it is decided, under names that MLflow accepts."""
     metrics: dict[str, Any] = {}
     for row in comparison.tables["verdict"]:
         if row["seeds"]:
@@ -186,7 +186,7 @@ def _metrics(comparison: Comparison) -> dict[str, float]:
 
 
 def _print(comparison: Comparison) -> None:
-    """Print the scores, what the answers rest on, and last the answers; all else is on the page."""
+    """Print scores, caveats and, last, the answers; the page has the rest."""
     console = terminal.console(least=160)
     header, *rows = plain("scores", comparison.tables["scores"], comparison.question.score)
     table = Table(*header, title=f"scores by {', '.join(comparison.by)}")
@@ -202,12 +202,12 @@ def _print(comparison: Comparison) -> None:
 
 
 def _print_film(played: Sequence[Training | Player]) -> None:
-    """Say where the highest score can be seen, if it was filmed."""
+    """Print the path of the film of the highest score, if there is one."""
     best = max(played, key=lambda each: each.episodes.scores.max(), default=None)
     if best is not None and best.film is not None and best.film.exists():
         print(f"\nthe highest score, {best.episodes.scores.max():,.0f}, as a film: {best.film}")
 
 
 def _slug(groups: Sequence[str]) -> str:
-    """Make a file's name of groups' labels."""
+    """Join the labels of groups to a file name."""
     return re.sub(r"[^A-Za-z0-9.]+", "-", "-vs-".join(groups))[:80].strip("-.") or "group"

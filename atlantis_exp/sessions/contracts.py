@@ -1,4 +1,4 @@
-"""The verb `check`: try each contract on the named components, then measure their cost next to ours."""
+"""Test each contract of the named components, then measure their cost next to that of built-in ones."""
 
 import copy
 import random
@@ -37,7 +37,7 @@ from atlantis_exp.training.checkpoint import Checkpoints, to_safetensors
 from atlantis_exp.training.fingerprint import fingerprint
 
 Contract = tuple[str, str, Callable[[], object]]
-"""A component, its contract, and a call that raises if the contract is broken."""
+"""A component, a contract, and a test that raises if the contract is broken."""
 
 _SIDES = (84, 159)  # pixels
 _ACTIONS = 4
@@ -50,7 +50,7 @@ _HEADS: dict[str, Head] = {
 
 
 def check(contracts: Iterator[Contract], measured: Mapping[str, Job]) -> None:
-    """Try every contract; if all are kept, measure the costs of trainings, by name. Raises: Fault otherwise."""
+    """Test every contract; if all are kept, measure the costs of trainings. Raises: Fault if one is broken."""
     tried, wanted, now = list[documents.Trial](), [*contracts], ""
     with terminal.working("checking", lambda: now):
         for number, (part, contract, trial) in enumerate(wanted, 1):
@@ -76,7 +76,7 @@ def check(contracts: Iterator[Contract], measured: Mapping[str, Job]) -> None:
 
 
 def contracts_of(config: Config, small: Job, kinds: Collection[str]) -> Iterator[Contract]:
-    """Yield every contract of a config's components of these kinds; `small` is a training of them of seconds."""
+    """Yield the contracts of a config's components of these kinds; `small` is a training that takes seconds."""
     import_components(config)
     if "model" in kinds:
         network = f"model={config.model.name}"
@@ -85,19 +85,19 @@ def contracts_of(config: Config, small: Job, kinds: Collection[str]) -> Iterator
                 for precision in ("fp32", "bf16"):
                     trial = partial(_learns, config, head, side, precision)
                     yield network, f"learns: {head}, {side} pixels, {precision}", trial
-        yield network, "the same seed, the same weights", partial(_same_weights, config)
-        yield network, "weights there and back, on meta too", partial(_weights_return, config)
-        yield network, "draws from no global stream", partial(_network_draws_nothing, config)
+        yield network, "same seed, same weights", partial(_same_weights, config)
+        yield network, "loads its saved weights, also on meta", partial(_weights_return, config)
+        yield network, "draws no global random numbers", partial(_network_draws_nothing, config)
         if config.model.component is not None and config.model.component.facts["splits_batches"]:
-            yield network, "a batch in parts is the batch", partial(_splits, config)
+            yield network, "a split batch gives the same values", partial(_splits, config)
     if "objective" in kinds:
         objective = f"objective={config.objective.name}"
-        yield objective, "targets and losses a sample, finite", partial(_objective_is_whole, config)
-        yield objective, "discount 0: rewards alone", partial(_objective_ends, config)
+        yield objective, "one finite target and loss per sample", partial(_objective_is_whole, config)
+        yield objective, "at discount 0 only rewards count", partial(_objective_ends, config)
     if "sampler" in kinds:
         for name, part in {part.name: part for part in map(config.sampler_of, config.phase)}.items():
-            yield f"sampler={name}", "a batch of available transitions", partial(_draws, config, part)
-            yield f"sampler={name}", "state there and back", partial(_sampler_continues, config, part)
+            yield f"sampler={name}", "draws available transitions", partial(_draws, config, part)
+            yield f"sampler={name}", "continues from its saved state", partial(_sampler_continues, config, part)
     if "epsilon" in kinds:
         trial = partial(_schedule_holds, config, config.epsilon, 1.0)
         yield f"epsilon={config.epsilon.name}", "in [0, 1], before and past the end", trial
@@ -106,10 +106,10 @@ def contracts_of(config: Config, small: Job, kinds: Collection[str]) -> Iterator
         yield f"lr_schedule={config.lr_schedule.name}", "finite, not negative", trial
     if "env" in kinds:
         yield f"env.id={config.env.id}", "actions are ALE's, points sum to rewards", partial(_pays, config)
-    yield "all", "killed and continued is unbroken, bit for bit", partial(_resumes, small)
+    yield "all", "killed and continued equals unbroken, bit for bit", partial(_resumes, small)
 
 
-def _hold(is_kept: object, otherwise: str) -> None:
+def _require(is_kept: object, otherwise: str) -> None:
     if not is_kept:
         raise Fault(otherwise)
 
@@ -133,14 +133,16 @@ def _learns(config: Config, head: str, side: int, precision: Any) -> None:
     optimizer = torch.optim.SGD(network.parameters(), lr=1e-3)
     learner = Learner(network, target, optimizer, objective, 1.0, precision=precision)
     states = np.random.default_rng(0).integers(0, 256, (6, config.env.stack, side, side), np.uint8)
-    _hold(learner.q_values(states).shape == (6, _ACTIONS), f"values of shape {learner.q_values(states).shape}")
+    _require(learner.q_values(states).shape == (6, _ACTIONS), f"values of shape {learner.q_values(states).shape}")
     before = copy.deepcopy(network.state_dict())
     rewards = np.arange(6, dtype=np.float32)
     errors = learner.update(states, np.arange(6) % _ACTIONS, rewards, states, np.full(6, 0.9, np.float32))
     after = network.state_dict()
-    _hold(errors.isfinite().all(), "an error is not finite")
-    _hold(all(value.isfinite().all() for value in after.values()), "a weight is not finite")
-    _hold(any(not torch.equal(before[name], after[name]) for name, _ in network.named_parameters()), "no weight moved")
+    _require(errors.isfinite().all(), "an error is not finite")
+    _require(all(value.isfinite().all() for value in after.values()), "a weight is not finite")
+    _require(
+        any(not torch.equal(before[name], after[name]) for name, _ in network.named_parameters()), "no weight moved"
+    )
 
 
 def _same_weights(config: Config) -> None:
@@ -170,7 +172,7 @@ def _no_global_stream() -> Iterator[None]:
     before = streams()
     yield
     moved = [name for name, a, b in zip(("torch", "numpy", "random"), before, streams(), strict=True) if a != b]
-    _hold(not moved, f"draws from the global stream of {', '.join(moved)}")
+    _require(not moved, f"draws from the global generator of {', '.join(moved)}")
 
 
 def _network_draws_nothing(config: Config) -> None:
@@ -205,10 +207,10 @@ def _objective_is_whole(config: Config) -> None:
         target = _targets(config, 0.9, 1)
         losses = build_component(config, config.objective).losses(q, torch.arange(6) % _ACTIONS, target)
         losses.mean().backward()
-    _hold(target.shape == (6, *q.shape[2:]), f"targets of shape {tuple(target.shape)}")
-    _hold(losses.shape == (6,), f"losses of shape {tuple(losses.shape)}")
-    _hold(losses.isfinite().all(), "a loss is not finite")
-    _hold(q.grad is not None and bool(q.grad.abs().sum() > 0), "no gradient")
+    _require(target.shape == (6, *q.shape[2:]), f"targets of shape {tuple(target.shape)}")
+    _require(losses.shape == (6,), f"losses of shape {tuple(losses.shape)}")
+    _require(losses.isfinite().all(), "a loss is not finite")
+    _require(q.grad is not None and bool(q.grad.abs().sum() > 0), "no gradient")
 
 
 def _objective_ends(config: Config) -> None:
@@ -229,8 +231,8 @@ def _draws(config: Config, part: ComponentConfig) -> None:
         drawn = sampler.sample(memory, 16, np.random.default_rng(0))
         if drawn.weights is not None:
             sampler.feed_back(drawn.ids, np.ones(16, np.float32))
-    _hold(drawn.ids.shape == (16,), f"{drawn.ids.shape} transitions for a batch of 16")
-    _hold(memory.available(drawn.ids).all(), "a transition that is not available")
+    _require(drawn.ids.shape == (16,), f"{drawn.ids.shape} transitions for a batch of 16")
+    _require(memory.available(drawn.ids).all(), "a transition that is not available")
 
 
 def _sampler_continues(config: Config, part: ComponentConfig) -> None:
@@ -244,14 +246,14 @@ def _sampler_continues(config: Config, part: ComponentConfig) -> None:
     other.load_state_dict(copy.deepcopy(sampler.state_dict()))
     for seed in range(3):
         ids = [each.sample(memory, 8, np.random.default_rng(seed)).ids for each in (sampler, other)]
-        _hold((ids[0] == ids[1]).all(), "draws other transitions than before")
+        _require((ids[0] == ids[1]).all(), "draws other transitions than before")
 
 
 def _schedule_holds(config: Config, part: ComponentConfig, highest: float) -> None:
     schedule = build_component(config, part)
     with _no_global_stream():
         values = [float(schedule(step / 100, 1_000 * step)) for step in range(151)]
-    _hold(all(0 <= value <= highest for value in values), f"{min(values)} to {max(values)}")
+    _require(all(0 <= value <= highest for value in values), f"{min(values)} to {max(values)}")
 
 
 def _pays(config: Config) -> None:
@@ -260,7 +262,7 @@ def _pays(config: Config) -> None:
     for _ in range(500):
         step = emulator.step(int(rng.integers(len(emulator.game.actions))))
         is_split = bool(emulator.game.sources)
-        _hold(not is_split or sum(step.points) == step.reward, f"{step.points} for a reward of {step.reward}")
+        _require(not is_split or sum(step.points) == step.reward, f"{step.points} for a reward of {step.reward}")
         if step.terminated or step.truncated:
             emulator.reset()
 
@@ -269,14 +271,14 @@ def _resumes(small: Job) -> None:
     with tempfile.TemporaryDirectory() as folder:
         whole, killed = Path(folder, "unbroken"), Path(folder, "killed")
         _train(small, whole)
-        _hold(_train(small, killed, kill=True), "the training was too short to be killed")
+        _require(_train(small, killed, kill=True), "the training was too short to be killed")
         _train(small, killed)
         one, other = fingerprints(small.config, whole), fingerprints(small.config, killed)
-    _hold(one == other, f"{', '.join(part for part in one if one[part] != other[part])} differ")
+    _require(one == other, f"{', '.join(part for part in one if one[part] != other[part])} differ")
 
 
 def _train(small: Job, outputs: Path, kill: bool = False) -> bool:
-    """Train in a process of its own, with `kill` to the first commit; return whether it was killed. Raises: Fault."""
+    """Train in a new process; with `kill`, kill it at the first commit. Return whether it was killed. Raises: Fault."""
     own = replaced(small.overrides, f"paths.outputs={outputs}", "tracking.commit_seconds=1.0", "resume=auto")
     command = (sys.executable, "-m", "atlantis_exp", "train", *own)
     with (
@@ -293,12 +295,12 @@ def _train(small: Job, outputs: Path, kill: bool = False) -> bool:
             process.kill()
         if code not in (0, -signal.SIGKILL):
             said.seek(0)
-            raise Fault(f"a session failed: {(said.read().splitlines() or ['it said nothing'])[-1]}")
+            raise Fault(f"a session failed: {(said.read().splitlines() or ['it printed nothing'])[-1]}")
     return code != 0
 
 
 def fingerprints(config: Config, outputs: Path) -> dict[str, str]:
-    """Return the hashes of a training that has ended under `outputs`. Raises: Fault."""
+    """Return the hashes of an ended training under `outputs`. Raises: Fault."""
     memory = build_memory(config)
     folder = RunFolder(outputs / "runs" / config.run_name())
     state = Checkpoints(folder.checkpoints, config.identity()).load(memory)
@@ -308,7 +310,7 @@ def fingerprints(config: Config, outputs: Path) -> dict[str, str]:
 
 
 def _cost(name: str, job: Job, said: str) -> documents.Cost:
-    """Measure a training on this machine; an update includes the draw of its batch."""
+    """Measure a training on this machine; an update includes drawing its batch."""
     trainer, speed = measure(job, said=said)
     size, batch = job.config.env.size, job.config.training.batch_size
     return documents.Cost(

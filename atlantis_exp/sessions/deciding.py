@@ -1,7 +1,7 @@
-"""A question answered: trains the seeds that it needs, looks when a look is due, stops when it is decided.
+"""Answer a question: train the seeds that it needs, look when a look is due, stop once it is decided.
 
-The runs are ordinary ones, and the looks are those of `compare` over them, whose folder remembers them: killed at any
-moment, the same command goes on where it was.
+The runs are ordinary ones. `compare` takes the looks, and its folder keeps them, so that the same command continues a
+decision that was killed.
 """
 
 import sys
@@ -39,19 +39,19 @@ from atlantis_exp.training.forecast import duration
 
 
 class Contest:
-    """Contenders, what is asked of them, and how they are trained.
+    """A question about contenders, and the way to train them.
 
     Args:
         chosen: the overrides of each contender that tell it from the others.
-        several: the overrides with several values, as typed; none: the contenders are no such product.
+        several: the overrides with several values, as typed; empty if `against` makes the contenders.
         fixed: the overrides that all contenders share.
         launcher: runs the trainings; None: as many at a time as the machine runs well.
-        on_a_node: trains a job of these overrides in a process of Slurm's.
-        job_of: the training that overrides make.
-        command: what continues it.
+        on_a_node: trains the job of some overrides in a process that Slurm has started.
+        job_of: returns the training of some overrides.
+        command: continues the decision.
 
-    Raises: ConfigError if two contenders are the same training, their scores would not mean the same, a run was trained
-    for longer, or the baseline is none of them.
+    Raises: ConfigError if two contenders are the same training, their scores are not comparable, a run was trained for
+    longer, or the baseline is not a contender.
     """
 
     def __init__(
@@ -78,57 +78,57 @@ class Contest:
         groups = {each: Group(values_in(facts[each], by), {}) for each in chosen}
         self.contenders = {groups[each].label: job for each, job in jobs.items()}
         named: dict[str, tuple[str, ...]] = {}  # by label, and by the name of the run
-        for each in chosen:  # two may be written alike
+        for each in chosen:  # two may have the same label
             if (twin := named.setdefault(groups[each].label, each)) is not each:
                 raise ConfigError(f"{' '.join(each)}: the same contender as {_said(twin)}")
             if (twin := named.setdefault(jobs[each].config.run_name(), each)) is not each:
-                raise ConfigError(f"{' '.join(each)}: trains what {_said(twin)} trains, under the same name")
+                raise ConfigError(f"{' '.join(each)}: makes the same run as {_said(twin)}")
         if mixed := mixed_protocol({groups[each].label: facts[each] for each in chosen}, by):
             raise ConfigError(f"{mixed[1]}; give that key itself several values, or train them under one protocol")
         explored = [
             {key: value for key, value in each.items() if key.startswith("epsilon.")} for each in facts.values()
         ]
         if question.score == "training" and any(each != explored[0] for each in explored):
-            raise ConfigError("score=training: contenders differ in epsilon, which is a part of it; use score=last")
+            raise ConfigError("score=training: depends on epsilon, in which contenders differ; use score=last")
         self.families = families(list(groups.values()), self.question)  # without seeds
         for folder in self.runs:
             if (longer := folder.beyond(self.config.budget.limits)) is not None:
                 raise ConfigError(
                     f"{longer[0]}: run {folder.name} was trained for {longer[1]}; ask for as many, "
-                    "or for other paths.outputs"
+                    "or name other paths.outputs"
                 )
 
     @property
     def config(self) -> Config:
-        """The first contender's; what says how trainings are run and measured is the same for all."""
+        """The first contender's config; all share the keys for running and measuring trainings."""
         return next(iter(self.contenders.values())).config
 
     @property
     def outputs(self) -> Path:
-        """Where everything goes that is written."""
+        """The folder that everything is written to."""
         return Path(self.config.paths.outputs)
 
     @cached_property
     def folder(self) -> RunFolder:
-        """Where the decision has its page: the same question of the same trainings is the same decision."""
+        """The folder of the decision's page: one for each question about the same trainings."""
         identity = {
             **self.question.identity,
             "runs": sorted(folder.name for folder in self.runs),
             "budget.steps": self.config.budget.steps,
             "evaluation.epsilon": self.config.evaluation.epsilon,
         }
-        if self.config.budget.flops is not None:  # an older decision names none
+        if self.config.budget.flops is not None:  # older decisions lack the key
             identity["budget.flops"] = self.config.budget.flops
         return RunFolder(self.outputs / "decisions" / f"decide-{digest(identity)}")
 
     @property
     def looks(self) -> tuple[int, ...]:
-        """The planned looks: numbers of seeds a contender."""
+        """The planned looks: numbers of seeds per contender."""
         return looks_up_to(self.question.seeds)
 
     @cached_property
     def here(self) -> Launcher:
-        """What runs the trainings; the machine is not asked again amid the decision."""
+        """The launcher; the machine is asked only once for a decision."""
         if self.launcher is not None:
             return self.launcher
         return fitting([*self.contenders.values()], len(self.contenders) * self.looks[0])
@@ -140,7 +140,7 @@ class Contest:
 
     @property
     def comparing(self) -> str:
-        """The command that compares the runs as they have been here, which spends no error and finds nothing else."""
+        """The command that repeats this comparison, without spending error."""
         question = self.question
         delta = question.delta and (f"{100 * question.delta:.12g}%" if question.relative else f"{question.delta:.12g}")
         return command_line(
@@ -157,7 +157,7 @@ class Contest:
         """Return the training of a contender with a seed."""
         job = self.contenders[label]
         overrides = (*job.overrides, f"seed={seed}")
-        if any("${" in text for text in overrides):  # a value may follow from the seed; else composing is slow
+        if any("${" in text for text in overrides):  # compose anew, since a value may follow from the seed
             return self._job_of(overrides)
         return replace(job, config=replace(job.config, seed=seed), overrides=overrides)
 
@@ -169,7 +169,7 @@ class Contest:
         return folder.ended(self.config.budget.limits) is not None
 
     def look(self) -> Comparison | None:
-        """Return the comparison of the runs there, with the look that is due; None before the first look's seeds."""
+        """Compare the ended runs and take the look that is due; return None before the first one is possible."""
         ended = [folder.name for folder in self.runs if self._has_ended(folder)]
         self.folder.write_config({"command": self.command, "runs": ended})
         if any(self.left(label, range(self.looks[0])) for label in self.contenders):
@@ -188,15 +188,15 @@ class Contest:
         for label, seeds in needed.items():
             if unusable := set(seeds) - set(self.left(label, seeds)):
                 name = self.run(label, min(unusable)).name
-                raise Fault(f"run {name} has ended and cannot be compared; above it says why")
+                raise Fault(f"run {name} has ended but cannot be compared, as the warning above explains")
         return needed
 
     def left(self, label: str, seeds: Iterable[int]) -> list[int]:
-        """Return those of some seeds with which a contender has not been trained to its end."""
+        """Return the seeds with which a contender has not been trained to the end."""
         return [seed for seed in seeds if not self._has_ended(self.run(label, seed))]
 
     def jobs(self, needed: Mapping[str, Sequence[int]]) -> list[Job]:
-        """Return the trainings of seeds of contenders, all contenders' first seed before their second ones."""
+        """Return the needed trainings: the first seed of every contender before the second."""
         order = sorted((seed, at, label) for at, (label, seeds) in enumerate(needed.items()) for seed in seeds)
         return [self.job(label, seed) for seed, _, label in order]
 
@@ -206,14 +206,14 @@ def _said(overrides: Sequence[str]) -> str:
 
 
 def decide(contest: Contest, trained: Callable[[Job], int | None] | None = None) -> None:
-    """Train the contenders' seeds in the order of the plan, look, drop what is decided, and say the answer.
+    """Train the seeds of the plan, look, drop what is decided, and print the answer.
 
     trained: trains a job in this process, one after the other; None: the contest's launcher does.
 
-    Raises: Fault if a training fails; the same command goes on.
+    Raises: Fault if a training fails; the same command continues.
     """
     tracking = contest.config.tracking
-    again = f"the decision goes on with: {contest.command}"
+    again = f"continue the decision with: {contest.command}"
     catch_up(contest.outputs, tracking.uri)
     shown = labels(
         f"decide {' '.join(contest.several) or ' against '.join(contest.contenders)}", run_colour("decide"), "decision"
@@ -248,22 +248,22 @@ def decide(contest: Contest, trained: Callable[[Job], int | None] | None = None)
         ):
             error = contest.question.error
             print(
-                f"Nothing is left of error={error:g} for a look at {contest.looks[-1]} seeds, so none is trained. "
-                f"To look further, allow a larger one, as in error={2 * error:g}"
+                f"error={error:g} is spent, so seeds for a look at {contest.looks[-1]} are not trained. "
+                f"To look further, allow a larger error, as in error={2 * error:g}"
             )
-        print(f"its runs again: {contest.comparing}")
+        print(f"compare its runs again: {contest.comparing}")
         terminal.document(comparison.document("decide").model_dump_json())
 
 
 def say_what_it_takes(contest: Contest) -> None:
-    """Print how many runs there may be, the hours that they take here, and the difference that they can find."""
+    """Print the number of runs, the hours that they take here, and the difference that they can find."""
     say = terminal.console().print
     looks, count = contest.looks, len(contest.contenders)
     missing = {label: len(contest.left(label, range(looks[-1]))) for label in contest.contenders}
     fewest = f"{count * looks[0]} to " if len(looks) > 1 else ""
     say(
         f"{', '.join(contest.contenders)}: {fewest}{count * looks[-1]} runs, looks at "
-        f"{' and '.join(map(str, looks))} seeds each; {count * looks[-1] - sum(missing.values())} are there."
+        f"{' and '.join(map(str, looks))} seeds each; {count * looks[-1] - sum(missing.values())} exist."
     )
     launcher, hours = BASIC if contest.launcher else contest.here, 0.0
     cores = launcher.settings.get("cores")
@@ -276,7 +276,7 @@ def say_what_it_takes(contest: Contest) -> None:
             say(f"{label}: {duration(forecast)} a run, {'on its share' if cores else 'alone on this machine'}")
     if hours:
         at_once = launcher.settings.get("n_jobs", 1)
-        how = "so many at a time" if at_once > 1 else "where they run one after the other"
+        how = "side by side" if at_once > 1 else "one after the other"
         say(f"at most {duration(hours / at_once)} {how}, evaluations not counted")
     if (known := _spread(contest)) is None:
         return
@@ -289,8 +289,8 @@ def say_what_it_takes(contest: Contest) -> None:
         if family.plan.delta is not None:
             least = 100 * equivalence(family.plan, averaged, pairs)
             words += f", and no difference where delta is {least:.0f} % or more,"
-        say(f"{words} with 80 % at {looks[-1]} seeds")
-    say(f"(if a contender's seeds differ as {whence}: {100 * spread:.0f} % of their mean, standard deviation)")
+        say(f"{words} with a probability of 80 % at {looks[-1]} seeds")
+    say(f"(if the standard deviation over seeds is {100 * spread:.0f} % of the mean, as {whence})")
 
 
 def _spread(contest: Contest) -> tuple[float, str] | None:
@@ -311,18 +311,18 @@ def _spread(contest: Contest) -> tuple[float, str] | None:
         if len(set(scores)) > 2 and np.mean(scores) > 0:
             shares.append(float(np.std(scores, ddof=1) / np.mean(scores)))
     if shares:
-        return float(np.mean(shares)), "those that are there do"
+        return float(np.mean(shares)), "in the existing runs"
     # Of five seeds the range is 2.326 standard deviations on average.
     published = [
         (row["high"] - row["low"]) / 2.326 / row["mean"]
         for row in curves(contest.config.game)
         if row["source"].startswith("google/dopamine") and row["mean"] > 0
     ]
-    return (float(np.median(published)), "published ones do (Dopamine's agents, five seeds)") if published else None
+    return (float(np.median(published)), "in published runs (Dopamine's, five seeds)") if published else None
 
 
 def _write(journal: Journal, contest: Contest, comparison: Comparison) -> None:
-    """Write to the page the looks that were taken and what is known now."""
+    """Write the looks taken and the answer to the page."""
     table = ["| look at seeds | pair | said | difference | interval | error spent |", f"|{' --- |' * 6}"] + [
         f"| {look.size} | {verdict.group} over {verdict.other} | {verdict.said} | {verdict.difference:,.0f} "
         f"| {verdict.low:,.0f} to {verdict.high:,.0f} | {look.error:.2%} |"
@@ -330,7 +330,7 @@ def _write(journal: Journal, contest: Contest, comparison: Comparison) -> None:
         for look in answer.decision.looks
         for verdict in look.verdicts
     ]
-    commands = [f"Continue or report: `{contest.command}`", f"Its runs again: `{contest.comparing}`"]
+    commands = [f"Continue or report: `{contest.command}`", f"Compare its runs again: `{contest.comparing}`"]
     journal.tags({"verdict": comparison.verdict})
     said = [comparison.verdict, *comparison.others, *comparison.caveats]
     journal.note("\n\n".join([*said, "\n".join(table), *commands]))

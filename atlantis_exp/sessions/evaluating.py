@@ -1,4 +1,4 @@
-"""Let any player play, print its report, and keep the evaluation as a run of its own."""
+"""Let a player play, print its report, and record the evaluation as a run."""
 
 import re
 import shutil
@@ -36,7 +36,7 @@ from atlantis_exp.training.evaluation import Evaluation, Stopped
 from atlantis_exp.training.progress import Progress
 
 STORED = ("latest", "best")
-"""The weights of a stored run; any other value of `weights` names a folder of exported ones."""
+"""The weights of a stored run; other values of `weights` name folders of exported ones."""
 
 
 def evaluate(
@@ -73,7 +73,7 @@ def evaluate(
         source = {"weights": name, "sha256": card.sha256}
         protocol: dict[str, Any] = {
             key: getattr(card.evaluation, key)
-            # num_envs, too: rounding, and so the choice in a near tie, depends on the size of a batch.
+            # num_envs, too: a batch's size changes rounding, which decides near ties.
             for key in ("episodes", "epsilon", "seed", "num_envs")
             if not set(asked) & {"evaluation", f"evaluation.{key}"}
         }
@@ -93,7 +93,7 @@ def evaluate(
 
 
 def _placeable(name: str) -> str:
-    """Return a name that a run's folder may have."""
+    """Turn a name into one that a run's folder may have."""
     return re.sub(r"[^A-Za-z0-9_.,~+=@-]+", "-", name).lstrip("_.,~+=@-")[:150] or "weights"
 
 
@@ -135,7 +135,7 @@ def play(
 ) -> None:
     """Let a person play at the game's 60 frames a second, print the report's table, and record it.
 
-    Picture and keys follow its steps, as for the networks.
+    The picture changes and keys are read once a step, as for the networks.
     """
     outputs = Path(paths.outputs)
     catch_up(outputs, tracking.uri)
@@ -166,7 +166,7 @@ def _facts(**parts: Any) -> dict[str, Any]:
 
 @contextmanager
 def _held(folder: RunFolder) -> Iterator[None]:
-    """Hold a run's folder before a game is played; remove a new one if nothing was recorded."""
+    """Hold a run's folder while a game is played; remove a new one if nothing was recorded."""
     is_new = not folder.path.exists()
     with folder.held():
         try:
@@ -195,7 +195,7 @@ def _record(
     shown: Mapping[str, str],
     command: str,
 ) -> None:
-    """Print an evaluation as the report does, and record it in a held folder with `facts` as its params."""
+    """Print an evaluation's report, and record it in a held folder with `facts` as its params."""
     evaluation, video = played
     print(f"\n{evaluation.report()}\n")
     with publishing(folder, tracking, outputs, shown) as journal:

@@ -56,7 +56,7 @@ def export(
     settings = replace(evaluation, video=False, num_envs=evaluation.at_once)
     progress = Progress()
     try:
-        with whole(folder) as place:  # before the episodes: the place may be refused
+        with whole(folder) as place:  # before playing: the folder may be refused
             progress.say(f"{source.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
             played = build_evaluator(trained.env, settings, cores)(actor, settings.episodes, progress)
             card = Card(
@@ -74,7 +74,7 @@ def export(
             )
             write_card(place, folder, card, packed, played, exported and exported.content)
     except OSError as error:
-        raise Fault(f"to={folder}: {error}; nothing is written: make room there, or name another folder") from error
+        raise Fault(f"to={folder}: {error}; nothing is written; make room there, or name another folder") from error
     print(f"\n{played.report()}\n\n{len(packed):,} bytes in {precision}, with card and scores, in {folder}")
     if exported:
         print(f"network.onnx: within {exported.difference:.1g} of torch's values in {exported.states} states")
@@ -96,7 +96,7 @@ def _history(run: RunFolder, step: int) -> tuple[dict[str, float], dict[str, str
 
 
 def _without_places(command: str) -> str:
-    """Return a command without this machine's outputs and servers, and with the names of other paths alone."""
+    """Return a command without this machine's outputs and servers, and with other paths cut to their names."""
     try:
         words = shlex.split(command)
     except ValueError:  # forged

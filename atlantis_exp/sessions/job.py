@@ -1,4 +1,4 @@
-"""One training as it was asked for: its config, its title, and the command that repeats it."""
+"""Describe a training that was asked for: its config, title and command."""
 
 import re
 import shlex
@@ -17,7 +17,7 @@ class Job:
     """A training for this process, perhaps one of a sweep."""
 
     config: Config
-    words: tuple[str, ...] = ()  # the choices besides network, sampler and seed, in short
+    words: tuple[str, ...] = ()  # choices besides network, sampler and seed, shortened
     overrides: tuple[str, ...] = ()  # as typed, of this job alone
     machine: Machine = field(default_factory=here)
 
@@ -33,7 +33,7 @@ class Job:
 
     @property
     def title(self) -> str:
-        """The name that people read: network, samplers, seed, then other choices: `resnet top_half s1`."""
+        """The name for people: network, samplers, seed, then other choices: `resnet top_half s1`."""
         return " ".join([*self._player, f"s{self.config.seed}", *self.words])
 
     @property
@@ -67,7 +67,7 @@ def command_line(*arguments: str) -> str:
 
 
 def quoted(value: str) -> str:
-    """Return a text as Hydra reads it, in quotes if needed."""
+    """Quote a text for Hydra if needed."""
     if re.fullmatch(r"[\w/.+-]+", value, re.ASCII):
         return value
     escaped = value.replace("'", r"\'")
@@ -76,7 +76,7 @@ def quoted(value: str) -> str:
 
 def config_colour(config: Config) -> str:
     """Return the colour of all runs with this config's network and last sampler."""
-    from atlantis_exp.media import run_colour  # numpy, without which a command line is checked
+    from atlantis_exp.media import run_colour  # imports numpy, which checking a command line does without
 
     return run_colour(config.model.name, list(config.phase.values())[-1].sampler)
 
@@ -87,7 +87,7 @@ def labels(title: str, colour: str, kind: str) -> dict[str, str]:
 
 
 def fitted(lines: Sequence[str], room: int, rest: str) -> str:
-    """Return the lines of a note that fit in `room` characters, then the number of others, which `rest` has."""
+    """Return the lines of a note that fit in `room` characters, then how many more `rest` has."""
     text = "\n".join(lines)
     if len(text) <= room:
         return text

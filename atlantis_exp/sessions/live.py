@@ -1,4 +1,4 @@
-"""Show a sweep's runs while other processes train them: a table on a terminal, plain lines elsewhere."""
+"""Show a sweep's runs while other processes train them: a table on a terminal, else plain lines."""
 
 import math
 import time
@@ -23,7 +23,7 @@ _ORDER: tuple[State, ...] = ("running", "failed", "interrupted", "done", "queued
 
 @dataclass
 class _Run:
-    """A run as of its last commit; only the new part of its journal is read."""
+    """A run as of its last commit; `look` reads only the new part of its journal."""
 
     title: str
     config: Config
@@ -31,10 +31,10 @@ class _Run:
     length: int  # of the plan, in its unit
     unit: str
     state: State = "queued"
-    values: dict[str, float] = field(default_factory=dict)  # the last ones of each metric
+    values: dict[str, float] = field(default_factory=dict)  # latest of each metric
     step: int = 0
     _identity: str = ""
-    _offset: int = 0  # bytes of the journal that are read
+    _offset: int = 0  # bytes read of the journal
     _updated: int = 0  # ms since 1970
 
     def look(self) -> None:
@@ -65,7 +65,7 @@ class _Run:
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """Title, state, how far it is, steps a second, time left, last score."""
+        """Title, state, progress, steps per second, time left, last score."""
         if not self.step:
             return self.title, self.state, "", "", "", ""
         speed, score = self.values.get("throughput/steps_per_second"), self.values.get("score/episode")
@@ -89,7 +89,7 @@ class _Run:
 
 
 class LiveTable:
-    """Shows the runs of a sweep; call `look` every `seconds`."""
+    """The shown runs of a sweep; call `look` every `seconds`."""
 
     def __init__(self, jobs: Sequence[Job], folders: Sequence[RunFolder], console: Console | None = None) -> None:
         self._console = console or terminal.console()
@@ -114,7 +114,7 @@ class LiveTable:
 
     def _draw(self) -> None:
         table = Table("run", "state", "as of its last commit", "steps/s", "left", "last score", box=None)
-        for run in sorted(self._runs, key=lambda run: _ORDER.index(run.state)):  # the last ones may not fit
+        for run in sorted(self._runs, key=lambda run: _ORDER.index(run.state)):  # the last rows may not fit
             table.add_row(*run.cells)
         if self._live is None:
             self._live = Live(console=self._console, auto_refresh=False, transient=True)

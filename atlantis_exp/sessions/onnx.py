@@ -1,4 +1,4 @@
-"""Write a network as ONNX, which plays without torch, and compare its values with torch's."""
+"""Export a network to ONNX, to play without torch, and compare its values with torch's."""
 
 import logging
 import warnings
@@ -27,7 +27,7 @@ class Exported(NamedTuple):
 
     content: bytes
     states: int
-    difference: float  # the largest of a value
+    difference: float  # the largest, in a value
 
 
 class _Values(nn.Module):
@@ -50,7 +50,7 @@ def require() -> None:
 def export_onnx(config: Config, weights: bytes) -> Exported:
     """Return a network as ONNX: `states`, uint8 (batch, stack, size, size), to `q_values`, float32 (batch, actions).
 
-    Raises: Fault if it cannot be written, or its values on states of a game are not torch's.
+    Raises: Fault if the export fails, or its values in states of a game differ from torch's.
     """
     network = build_trained_network(config, weights).eval()
     shape = config.env.stack, config.env.size, config.env.size
@@ -78,12 +78,12 @@ def export_onnx(config: Config, weights: bytes) -> Exported:
     here, there = _both(config, network, content)
     difference = float(np.abs(here - there).max())
     if not difference <= _TOLERANCE * max(1.0, float(np.abs(here).max())):
-        raise Fault(f"the network differs as ONNX: its values are up to {difference:g} from torch's")
+        raise Fault(f"the ONNX network differs from torch's by up to {difference:g} in its values")
     return Exported(content, len(here), difference)
 
 
 def _both(config: Config, network: nn.Module, content: bytes) -> tuple[Values, Values]:
-    """Return the values of torch and of ONNX Runtime in the states of a game played by chance."""
+    """Return the values of torch and of ONNX Runtime in states of a game with random actions."""
     import onnxruntime
 
     env, emulator = config.env, make_emulator(config.env)()

@@ -1,4 +1,4 @@
-"""The life cycle of a page: the folder of its own in which a sweep, a search, a decision or a comparison stands."""
+"""Open and close a page: the folder of a sweep, a search, a decision or a comparison."""
 
 import signal
 import sys
@@ -19,7 +19,7 @@ from atlantis_exp.tracking.publishing import publishing
 def ending(error: BaseException | None) -> tuple[Status, str]:
     """Return the last status of a page whose block raised `error`, and the reason.
 
-    A page that a signal or the end of the time has stopped was killed: the same command continues it.
+    A page stopped by a signal or its time limit is KILLED: the same command continues it.
     """
     if error is None:
         return "FINISHED", ""
@@ -45,10 +45,10 @@ def opened(
 
     The page is RUNNING in the block; `ending` gives its status after it.
 
-    labels: tags that the page has from its first moment.
-    command: what continues it.
+    labels: tags that the page has from the start.
+    command: continues the page.
     prepare: called once the folder is held, before anything is published.
-    others: runs of other processes that are published too.
+    others: runs of other processes to publish as well.
 
     Raises: Fault if another process holds the folder, or its journal is damaged.
     """
@@ -62,7 +62,7 @@ def opened(
                 yield journal
                 journal.flush()
             except BaseException as error:
-                with suppress(OSError):  # a full disk takes no status; the next command sees that nobody holds the page
+                with suppress(OSError):  # the disk may be full; the next command sees that no process holds the page
                     journal.status(*ending(error))
                 raise
             journal.status(*ending(None))
@@ -70,7 +70,7 @@ def opened(
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """Let SIGTERM end the process as an exception does; a run that is trained in the block listens for itself."""
+    """Turn SIGTERM into an exception; a training in the block installs its own handler."""
 
     def end(number: int, _: FrameType | None) -> NoReturn:
         sys.exit(128 + number)

@@ -11,13 +11,13 @@ from atlantis_exp.learning.process import OWN_THREADS, set_up_process
 
 
 def set_up_torch(config: Config, device: str) -> None:
-    """Set up torch in this process for a config's network: a thread to each shard of a batch, or all to the whole."""
+    """Set up torch in this process for a config's network: one thread per shard of a batch, or all for the whole."""
     shards = choose_shards(config, choose_device(device))
     set_up_process((config.threads or OWN_THREADS) // shards)
 
 
 def processor_name(device: torch.device) -> str:
-    """Return a device's name as its maker calls it; a CPU's with its instructions, on which the last bits depend."""
+    """Return a device's product name; a CPU's with its instruction set, on which the last bits depend."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     name = platform.processor() or platform.machine()  # Linux has no model in either

@@ -1,4 +1,4 @@
-"""Print the results that the outputs folder holds, as a table."""
+"""Print the results in the outputs folder as a table."""
 
 from collections.abc import Mapping, Sequence
 from math import isfinite
@@ -14,7 +14,7 @@ from atlantis_exp.tracking.publishing import catch_up, how_to_open
 
 
 def report(outputs: Path, runs: Sequence[str] = (), where: Sequence[str] = ()) -> None:
-    """Print a line for each run with its last evaluation; `runs` and `where` choose as those of `compare` do.
+    """Print a line for each run with its last evaluation; `runs` and `where` select as in `compare`.
 
     Raises:
         ConfigError: if no run matches a text of `runs` or has a key of `where`.
@@ -25,7 +25,7 @@ def report(outputs: Path, runs: Sequence[str] = (), where: Sequence[str] = ()) -
     reported = [_reported(run) for run in folders]
     terminal.document(Report(runs=reported).model_dump_json())
     if not folders:
-        print(f"there is no {'such ' if runs or where else ''}run under {outputs / 'runs'} yet")
+        print(f"no {'such ' if runs or where else ''}run under {outputs / 'runs'} yet")
         return
     shown = outputs.relative_to(Path.cwd()) if outputs.is_relative_to(Path.cwd()) else outputs
     columns = ("run", "steps", "mean", "+-", "median", "IQM", "high", "low", "random", "episodes")
@@ -76,7 +76,7 @@ def _chosen(outputs: Path, runs: Sequence[str], where: Sequence[str]) -> list[Ru
 
 
 def _last_evaluation(run: RunFolder) -> tuple[int, Mapping[str, float]]:
-    """Return the step of an unfinished run's last evaluation and its metrics; none before the first. Raises: Fault."""
+    """Return an unfinished run's last evaluation: step and metrics; none before the first. Raises: Fault."""
     found: tuple[int, Mapping[str, float]] = (0, {})
     for record in run.records():
         if isinstance(record, Metrics) and record.values.keys() >= EVALUATED:

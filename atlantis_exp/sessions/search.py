@@ -1,8 +1,8 @@
-"""A search for the best values of any keys, by Optuna.
+"""Search for the best values of any keys with Optuna.
 
-A search is a folder: Optuna's journal of the trials, a lock for each of them, and a page for their runs. Several
-processes may work on it. A trial whose lock nobody holds was killed: the next process continues it, and finds its runs
-by their identity.
+A search is a folder: Optuna's journal of trials, a lock for each trial, and a page for their runs. Several processes
+may share it. A running trial whose lock is free was killed: the next process continues it, and finds its runs by their
+identity.
 """
 
 import os
@@ -44,26 +44,26 @@ from atlantis_exp.sessions.training import train
 from atlantis_exp.tracking.store import first_line
 from atlantis_exp.training.trainer import Trainer
 
-_WAIT_SECONDS = 2.0  # between two looks at the trials of other processes
+_WAIT_SECONDS = 2.0  # between two looks at other processes' trials
 _SHOWN = 10  # rows of the table at the end
 
 
 @dataclass(frozen=True)
 class Search:
-    """A search as it was asked for: its space, its training, and its rules."""
+    """A search that was asked for: space, training and rules."""
 
     space: Mapping[str, BaseDistribution]
     texts: Mapping[str, str]  # the space, as typed
     overrides: Sequence[str]  # of the training, as typed
-    job_of: Callable[[Sequence[str]], Job]  # the training of some overrides; raises ConfigError
+    job_of: Callable[[Sequence[str]], Job]  # returns the training of some overrides; raises ConfigError
     corner: Job  # one of the trainings in the space
     trials: int
-    seeds: int  # trainings a trial
+    seeds: int  # trainings per trial
     name: str | None  # of its folder; None: a hash of the space and the training
     startup: int  # trials drawn at random
-    pruned_after: int | None  # trials that end before any is cut short; None: none is
-    spared: int  # first evaluations, at which a trial is never cut short
-    command: str  # that continues it
+    pruned_after: int | None  # trials that must end before any is pruned; None: never prune
+    spared: int  # first evaluations, at which a trial is never pruned
+    command: str  # continues the search
 
 
 Train = Callable[[Job, Callable[[Trainer], bool]], int | None]
@@ -73,10 +73,10 @@ def search(asked: Search, train: Train = train) -> None:
     """Train one trial after the other, with the values that Optuna proposes.
 
     Raises:
-        ConfigError: the folder is another search's.
-        Fault: the disk refuses, the time is over, or no trial was trained to its end.
+        ConfigError: the folder belongs to another search.
+        Fault: the disk fails, the time is up, or no trial finished.
     """
-    config, again = asked.corner.config, f"the search goes on with: {asked.command}"
+    config, again = asked.corner.config, f"continue the search with: {asked.command}"
     stop = StopRequest(config.budget.seconds)
     with stop.installed():
         trials = Trials(asked, train)
@@ -89,7 +89,7 @@ def search(asked: Search, train: Train = train) -> None:
             with ExitStack() as held:
                 while True:
                     if journal is None and not folder.is_held:
-                        with suppress(Fault):  # another process was faster
+                        with suppress(Fault):  # another process took it
                             journal = held.enter_context(page(ending=trials.ending))
                     if journal is not None:
                         trials.describe(journal)
@@ -99,7 +99,7 @@ def search(asked: Search, train: Train = train) -> None:
                         if trial is not None:
                             trials.train(trial, stop)
                     if trial is None:
-                        time.sleep(_WAIT_SECONDS)  # another process may leave its trial
+                        time.sleep(_WAIT_SECONDS)  # another process may drop its trial
         except SystemExit:
             terminal.warn(again)
             raise
@@ -109,7 +109,7 @@ def search(asked: Search, train: Train = train) -> None:
 
 
 class Trials:
-    """The trials of a search, which other processes may work on. Raises: ConfigError, Fault, as `search`."""
+    """The trials of a search, shared with other processes. Raises: ConfigError, Fault, as `search`."""
 
     def __init__(self, asked: Search, train: Train = train) -> None:
         config = asked.corner.config
@@ -118,16 +118,16 @@ class Trials:
             "training": config.science(),
             "budget.steps": config.budget.steps,
         }
-        if config.budget.flops is not None:  # an older search names none
+        if config.budget.flops is not None:  # older searches lack the key
             facts["budget.flops"] = config.budget.flops
-        if asked.seeds > 1:  # nor this one
+        if asked.seeds > 1:  # nor do they have this one
             facts["seeds"] = asked.seeds
         name = asked.name or f"search-{digest(facts)}"
         self.asked, self._train = asked, train
         self.folder = RunFolder(asked.corner.outputs / "searches" / name)
         with alone(self.folder.path / "alone.lock"):
             if self.folder.has_started and self.folder.config != facts:
-                raise ConfigError(f"name={name}: was begun for another space or another training; choose another name")
+                raise ConfigError(f"name={name}: is a search of another space or training; choose another name")
             self.folder.write_config(facts)
             self.study = _study(self.folder.path / "trials.jsonl", asked)
 
@@ -171,7 +171,7 @@ class Trials:
                 if left or len(trials) < self.asked.trials:
                     number = left[0].number if left else len(trials)
                     held.enter_context(self._lock(number).held())
-                    # A seed a trial: with one seed, several or restarted processes would propose the same.
+                    # One seed per trial: with a single one, all processes would propose the same values.
                     seed = stream(self.asked.corner.config.seed, f"trial {number}").generate_state(1).item()
                     self.study.sampler = TPESampler(seed=seed, n_startup_trials=self.asked.startup)
                     trial = Trial(self.study, left[0]._trial_id) if left else self.study.ask()
@@ -194,9 +194,9 @@ class Trials:
             self.study.tell(trial.number, float(np.mean(scores)))
         except TrialPruned:
             self.study.tell(trial.number, state=TrialState.PRUNED)
-        except (RuntimeError, MemoryError) as error:  # faults, and torch's errors, mostly of memory
+        except (RuntimeError, MemoryError) as error:  # a Fault, or torch's, mostly for lack of memory
             if isinstance(error.__cause__, OSError):
-                raise  # of the machine: every trial would fail
+                raise  # the machine's error: every trial would fail
             if not isinstance(error, Fault):
                 traceback.print_exc()
             trial.set_user_attr("error", first_line(error))
@@ -206,10 +206,10 @@ class Trials:
     def _score(self, trial: Trial, index: int, stop: StopRequest) -> float | None:
         """Train one of a trial's runs; return the mean of its last evaluation, None if `stop` ended it.
 
-        The best evaluation would be the luckiest. Raises: TrialPruned by the first run, Fault.
+        The best evaluation would be the luckiest one. Raises: TrialPruned (first run only), Fault.
         """
         job = self.job(trial, index)
-        # The time limit is the search's; an existing run is one that a killed process left.
+        # The search has the time limit. An existing run was left by a killed process.
         config = replace(job.config, resume="auto", budget=replace(job.config.budget, wall_clock=None))
         run = RunFolder.of(config)
         told = self.all[trial.number]
@@ -221,7 +221,7 @@ class Trials:
         def watch(trainer: Trainer) -> bool:
             nonlocal seen, pruned, stopped
             recorder = trainer.recorder
-            # By number, not by step: trials may have episodes of other lengths.
+            # By number, not by step: episodes of different trials differ in length.
             if index == 0 and recorder.evaluations > seen:
                 seen = recorder.evaluations
                 if seen not in told.intermediate_values:
@@ -241,26 +241,26 @@ class Trials:
         result = run.result
         assert result is not None
         if (longer := run.beyond(config.budget.limits)) is not None:
-            raise Fault(f"run {run.name} was trained for {longer[1]} already, more than {longer[0]}")
+            raise Fault(f"run {run.name} was already trained for {longer[1]}, more than {longer[0]}")
         return result.evaluation["evaluation/mean"]
 
     def job(self, trial: FrozenTrial | Trial, index: int) -> Job:
-        """Return one of a trial's trainings. Values drawn again are trained with other seeds."""
+        """Return one of a trial's trainings; values drawn again get other seeds."""
         before = sum(other.params == trial.params for other in self.all[: trial.number])
         seed = self.asked.corner.config.seed + before * self.asked.seeds + index
         return self.asked.job_of([*replaced(self.asked.overrides, f"seed={seed}"), *_values(trial)])
 
     def conclusion(self) -> list[str]:
-        """Return the ranking's caveats and the commands that test its best values, with other seeds, and train them."""
+        """Return the ranking's caveats, and commands that test its best values with other seeds and train them."""
         if not (ranking := self.ranking):
             return []
         best, asked, lines = ranking[0][0], self.asked, []
         if all(len(scores) == 1 for _, scores in ranking):
-            lines.append("One training each: other seeds may rank them differently; seeds=3 trains three a trial.")
+            lines.append("One training each: other seeds may rank them differently; seeds=3 trains three per trial.")
         if len(ranking) > 1:
             lines.append(f"The best of {len(ranking)} is partly luck: its own mean is optimistic.")
         job = self.job(best, 0)
-        with suppress(ConfigError):  # without the values, this may be no training
+        with suppress(ConfigError):  # without the values the config may be invalid
             default = asked.job_of(replaced(asked.overrides, f"seed={job.config.seed}"))
             if default.config.run_name() != job.config.run_name():
                 shared = _without(asked.overrides, "seed", "resume", "budget.wall_clock")
@@ -279,7 +279,7 @@ class Trials:
                 best = max(best, trial.value)
                 if trial.number not in told:
                     journal.metrics({"search/mean": trial.value, "search/best": best}, trial.number)
-        more = f"{self.counts()}. Continue, or help along from another terminal: `{self.asked.command}`"
+        more = f"{self.counts()}. Continue, or help from another terminal: `{self.asked.command}`"
         figures = f"Figures: `optuna-dashboard {self.folder.path / 'trials.jsonl'}`"
         above = "\n\n".join([more, *self.conclusion(), figures])
         journal.note(f"{above}\n\n{fitted(rows, NOTE_LENGTH - len(above), '`trials.jsonl`')}")
@@ -288,7 +288,7 @@ class Trials:
     def print_results(self) -> None:
         """Print the best values and their caveats. Raises: Fault if there are none."""
         if not (ranking := self.ranking):
-            raise Fault(f"search {self.folder.name}: no trial was trained to its end; {self.counts()}")
+            raise Fault(f"search {self.folder.name}: no trial finished; {self.counts()}")
         table = Table("trial", "mean", "95 %", *self.asked.space, "run", title=f"{self.folder.name}: {self.counts()}")
         for column in table.columns[:2]:
             column.justify = "right"
@@ -303,7 +303,7 @@ class Trials:
 
 
 def _study(file: Path, asked: Search) -> Study:
-    """Open Optuna's record of the trials, or begin one. Raises: Fault where it is damaged."""
+    """Open or begin Optuna's record of the trials. Raises: Fault if it is damaged."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     after = asked.pruned_after
     try:
@@ -327,8 +327,8 @@ def _study(file: Path, asked: Search) -> Study:
     except Exception as error:  # Optuna does not check its file
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise Fault(
-            f"{file} is damaged ({reason}): restore it, or begin anew with another name=, which finds the trials' "
-            "runs where it draws the same values"
+            f"{file} is damaged ({reason}): restore it, or start a search with another name=, which reuses runs of "
+            "the same values"
         ) from None
 
 

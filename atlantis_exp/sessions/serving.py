@@ -1,4 +1,4 @@
-"""The MLflow UI on the local store."""
+"""Serve the MLflow UI on the local store."""
 
 import socket
 from contextlib import suppress
@@ -14,9 +14,9 @@ from atlantis_exp.tracking.views import COMPARISONS, START, address, site
 
 
 def serve(*, port: int, paths: PathsConfig) -> None:
-    """Serve the store on 127.0.0.1 until interrupted, after publishing the runs that it lacks; print the addresses."""
+    """Publish the runs that the store lacks, print its addresses, and serve it on 127.0.0.1 until interrupted."""
     with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server will: a port just left is free
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server will: a port just released is free
         try:
             probe.bind(("127.0.0.1", port))
         except OSError as error:
@@ -24,7 +24,7 @@ def serve(*, port: int, paths: PathsConfig) -> None:
     outputs = Path(paths.outputs)
     store = Store(outputs)
     if missing := lacking(outputs):
-        with suppress(Fault):  # each run that fails is told
+        with suppress(Fault):  # `tell` warns of each run that fails
             tell(store.uri, publish_all(outputs, store, missing), is_first=True)
     try:
         with terminal.working("preparing MLflow's store"):

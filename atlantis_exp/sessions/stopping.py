@@ -1,4 +1,4 @@
-"""Ask a training to stop: by a signal, at the end of its time, or because its sweep has ended."""
+"""Ask a training to stop: on a signal, when its time is up, or when its sweep has ended."""
 
 import signal
 import sys
@@ -13,15 +13,15 @@ from atlantis_exp import interrupts, terminal
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder
 
-_LOOK_SECONDS = 1.0  # between two looks at whether the sweep goes on
+_LOOK_SECONDS = 1.0  # between two checks that the sweep goes on
 
 
 class StopRequest:
-    """Turns SIGINT, SIGTERM, SIGUSR2, the end of the time or of the sweep into a flag that the trainer asks for.
+    """A flag that the trainer polls, set by SIGINT, SIGTERM, SIGUSR2, the end of the time or of the sweep.
 
-    The time begins with the first look, after the first step, so that a session with a long set-up makes progress. A
-    second SIGINT ends the process at once; the last commit stays. Under Slurm SIGTERM is a warning: the run is
-    committed and goes on, since Slurm itself requeues or kills it.
+    Time counts from the first poll, after the first step, so that a session with a long set-up makes progress. A second
+    SIGINT ends the process at once; the last commit stays. Under Slurm SIGTERM is a warning: the run commits and goes
+    on, since Slurm itself requeues or kills it.
     """
 
     def __init__(
@@ -50,27 +50,27 @@ class StopRequest:
         return self.signal is not None or self._is_warned or self._sweep_has_ended or now >= self._deadline
 
     def was_a_warning(self) -> bool:
-        """Tell whether the run goes on after its commit; forget the warning."""
+        """Return whether the run goes on after its commit; forget the warning."""
         was_warned, self._is_warned = self._is_warned, False
         return was_warned and self.signal is None
 
     def end(self, message: str) -> NoReturn:
-        """End the process by the signal's exit code. Raises: Fault if none came, so that a sweep goes on."""
+        """Exit with the signal's code. Raises: Fault if none came, so that a sweep goes on."""
         if self.signal is None and self._sweep_has_ended:
             raise Fault(f"the sweep has ended: {message}", exit_code=128 + signal.SIGTERM)
         if self.signal is None:
-            raise Fault(f"budget.wall_clock: {message}", exit_code=124)  # as of timeout(1)
+            raise Fault(f"budget.wall_clock: {message}", exit_code=124)  # as timeout(1) does
         terminal.warn(f"{signal.Signals(self.signal).name}: {message}")
         if self.signal == signal.SIGUSR2 and callable(handler := self._before[signal.SIGUSR2]):
-            handler(self.signal, None)  # submitit's own requeues the job and exits
+            handler(self.signal, None)  # submitit's handler requeues the job and exits
         sys.exit(128 + self.signal)
 
     @contextmanager
     def installed(self) -> Iterator[None]:
-        """Listen while the block runs."""
+        """Handle the signals while the block runs."""
         signals = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
         self._before = {number: signal.signal(number, self._receive) for number in signals}
-        if interrupts.seen():  # and swallowed
+        if interrupts.seen():  # and was swallowed
             self.signal = signal.SIGINT
         try:
             yield
@@ -89,7 +89,7 @@ class StopRequest:
 
 
 def sweep_goes_on(folder: RunFolder, launcher: str | None) -> Callable[[], bool]:
-    """Return a call that tells whether the launcher of this job is alive; Slurm's jobs may outlive it."""
+    """Return a test of whether this job's launcher is alive; always true for Slurm, whose jobs may outlive it."""
     if folder.parent is None or launcher != "joblib":
         return lambda: True
     sweep = RunFolder(folder.parent)

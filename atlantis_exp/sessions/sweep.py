@@ -1,4 +1,4 @@
-"""A sweep as a run of its own that its trainings are shown under, with their table on its page."""
+"""Run a sweep as the parent run of its trainings, with their table on its page."""
 
 import threading
 from collections import Counter
@@ -24,7 +24,7 @@ from atlantis_exp.sessions.training import measure, train
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.training.forecast import duration
 
-_PAGE_SECONDS = 60.0  # between two looks at the runs while they are trained
+_PAGE_SECONDS = 60.0  # between two looks at the runs
 
 Runs = Mapping[RunFolder, Job]
 """The folders of a sweep's runs, each with its training."""
@@ -38,12 +38,12 @@ def sweep(
     on_a_node: Callable[[Sequence[str]], None],
     train: Callable[[Job], object] = train,
 ) -> None:
-    """Train jobs by a launcher, with the table of their runs before and after.
+    """Train jobs with a launcher; print the table of their runs before and after.
 
     Args:
-        swept: the overrides that name several values, as typed.
+        swept: the overrides with several values, as typed.
         command: repeats the sweep.
-        on_a_node: trains a job of these overrides in a process of Slurm's.
+        on_a_node: trains the job of some overrides in a process that Slurm has started.
         train: trains a job in this process.
 
     Raises: Fault if another process runs the same sweep, or a training failed, once all have ended.
@@ -66,9 +66,9 @@ def ledger(
 ) -> Iterator[None]:
     """Print a sweep's table of runs before and after the block, and keep its page (tracking=mlflow).
 
-    Jobs in other processes write their folders only: this one shows their progress and publishes them. A run's folder
-    names its parent before the first run starts, and the same set of runs has the same parent again. Arguments and
-    faults as for `sweep`.
+    Jobs in other processes only write their folders: this process shows their progress and publishes them. Each run's
+    folder names its parent before the first run starts; the same set of runs has the same parent. Arguments and faults
+    as for `sweep`.
     """
     runs = {RunFolder.of(job.config): job for job in jobs}
     is_shown = not launcher.is_basic or jobs[0].config.tracking.name != "none"
@@ -81,7 +81,7 @@ def ledger(
 
 
 def say_hours(jobs: Sequence[Job], launcher: Launcher) -> None:
-    """Print how many of a sweep's jobs are trained at a time, and the hours that all take if they are as the first."""
+    """Print how many of a sweep's jobs train at a time, and the hours for all if each takes as long as the first."""
     left = [job for job in jobs if not has_ended(job.config)]
     if not left:
         return
@@ -94,7 +94,7 @@ def say_hours(jobs: Sequence[Job], launcher: Launcher) -> None:
 
 
 def how_many(launcher: Launcher) -> str:
-    """Say how many trainings go on at a time."""
+    """Return how many trainings run at a time, in words."""
     if launcher.is_basic:
         return "one training after the other"
     cores = launcher.settings["cores"]
@@ -111,7 +111,7 @@ def _print_table(runs: Runs) -> None:
 
 
 def _reason(folder: RunFolder, state: State) -> str:
-    """Return why a run failed or was killed, and the file that tells more."""
+    """Return why a run failed or was killed, and the file with its traceback."""
     if not folder.error:
         return ""
     path = folder.path / TRACEBACK
@@ -127,14 +127,14 @@ def _page(runs: Runs, swept: Sequence[str], launcher: Launcher, command: str) ->
 
     def adopt_all() -> None:
         for folder, job in runs.items():
-            with suppress(Fault):  # what runs elsewhere stays where it is
+            with suppress(Fault):  # a run in another process keeps its parent
                 if job.config.resume == "never" and not launcher.is_basic and folder.has_started:
-                    print(f"the run that was here is kept as {folder.put_aside()}")
+                    print(f"the earlier run is kept as {folder.put_aside()}")
                 with folder.held():
                     adopt(folder.path, sweep.path)
 
     if not launcher.is_basic:
-        catch_up(outputs, config.tracking.uri)  # the jobs do not
+        catch_up(outputs, config.tracking.uri)  # the jobs do not do so
     others = () if launcher.is_basic else tuple(runs)
     with (
         terminable(),
@@ -161,12 +161,12 @@ def _page(runs: Runs, swept: Sequence[str], launcher: Launcher, command: str) ->
 
 @contextmanager
 def _every(seconds: float, look: Callable[[], None]) -> Iterator[None]:
-    """Call `look` now and then in a thread until the block ends."""
+    """Call `look` every `seconds` in a thread until the block ends."""
     closing = threading.Event()
 
     def run() -> None:
         while not closing.wait(seconds):
-            with suppress(OSError, ValueError, Fault):  # the next look may fare better
+            with suppress(OSError, ValueError, Fault):  # the next look may succeed
                 look()
 
     thread = threading.Thread(target=run, name=f"every {seconds:g} s", daemon=True)
@@ -202,7 +202,7 @@ def _describe(journal: Journal, runs: Runs) -> None:
                 row[9] = f"{result.counts['hours']:.2f}"
         lines.append(f"| {' | '.join(row)} |")
         if folder.state == "failed":
-            told = f" (`{TRACEBACK}` of the run tells all)" if (folder.path / TRACEBACK).exists() else ""
+            told = f" (details in `{TRACEBACK}` of the run)" if (folder.path / TRACEBACK).exists() else ""
             failures.append(f"- **{job.title} failed**: {folder.error}{told}")
     above = fitted(failures, NOTE_LENGTH // 4, "`runs.csv`") + "\n\n"
     journal.note(f"{above}{fitted(lines, NOTE_LENGTH - len(above), '`runs.csv`')}".strip())
@@ -210,7 +210,7 @@ def _describe(journal: Journal, runs: Runs) -> None:
 
 
 def _tabulate(journal: Journal, runs: Runs) -> None:
-    """Write all numbers of the sweep's runs."""
+    """Write all numbers of the sweep's runs to `runs.csv`."""
     rows: list[dict[str, Any]] = []
     for folder, job in runs.items():
         result = folder.result

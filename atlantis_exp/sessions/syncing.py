@@ -1,4 +1,4 @@
-"""Run folders published in an MLflow store, once or again and again."""
+"""Publish run folders to an MLflow store, once or repeatedly."""
 
 import sys
 import time
@@ -16,7 +16,7 @@ from atlantis_exp.tracking.store import Store, first_line
 
 
 class Sent(NamedTuple):
-    """How the publication of one run ended."""
+    """The outcome of publishing one run."""
 
     outcome: str  # published, up to date or failed
     run: str
@@ -32,10 +32,10 @@ def sync(
     paths: PathsConfig,
     wait: Callable[[float], object] = time.sleep,
 ) -> None:
-    """Publish all run folders, once or until interrupted; print a line a run that changed, and counts.
+    """Publish all run folders, once or until interrupted; print changed runs and counts.
 
-    Raises: Fault if the store cannot be reached or a run failed; with `every`, given as `seconds` too, that is printed,
-    and tried again.
+    Raises: Fault if the store cannot be reached or a run failed. With `every`, and its `seconds`, it warns and tries
+    again.
     """
     outputs = Path(paths.outputs)
     store = Store(outputs, tracking.experiment, to or tracking.uri)
@@ -47,17 +47,17 @@ def sync(
             except Fault as fault:
                 if seconds is None:
                     raise
-                terminal.warn(f"{fault}; looking again in {every}")
+                terminal.warn(f"{fault}; trying again in {every}")
             if seconds is None:
                 return
             is_first = False
             wait(seconds)
     except KeyboardInterrupt:
-        sys.exit(130)  # 128 + SIGINT; what has arrived is noted
+        sys.exit(130)  # 128 + SIGINT; sent runs are recorded
 
 
 def tell(uri: str, all_sent: Iterable[Sent], is_first: bool) -> None:
-    """Print what became of runs; counts only at first and if something was sent. Raises: Fault."""
+    """Print the outcomes of runs, and counts at first or after a change. Raises: Fault if a run failed."""
     counts: Counter[str] = Counter()
     for sent in all_sent:
         run = terminal.harmless(sent.run).replace("\n", " ")
@@ -74,7 +74,7 @@ def tell(uri: str, all_sent: Iterable[Sent], is_first: bool) -> None:
 
 
 def publish_all(outputs: Path, store: Store, folders: Sequence[RunFolder] | None = None) -> Iterator[Sent]:
-    """Publish run folders, by default all under `outputs`, and yield how each ended. Raises: Fault for the store."""
+    """Publish run folders, by default all under `outputs`, and yield the outcomes. Raises: Fault for the store."""
     try:
         with terminal.working(f"asking {store.uri} for its runs"):
             listed = {run.info.run_id for run in store.runs()}

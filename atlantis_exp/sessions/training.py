@@ -1,4 +1,4 @@
-"""A training as a session: opened, run, closed; the same job again continues it, or reports how it has ended."""
+"""Run a training as a session; the same job again continues it, or prints its result."""
 
 import dataclasses
 import signal
@@ -33,20 +33,20 @@ from atlantis_exp.training.plan import Counters
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Outcome, Trainer
 
-_FIXED = ("constant", "linear_steps")  # schedules that depend on no training's length
+_FIXED = ("constant", "linear_steps")  # schedules that do not depend on a training's length
 
 
 def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int | None:
-    """Start the run that a job is, continue it, or print its result if it has ended.
+    """Start a job's run, continue it, or print its result if it has ended.
 
-    As a job of a sweep that another process runs, it writes the run's folder only: that process publishes it.
+    If another process runs its sweep, the job only writes the run's folder, which that process publishes.
 
-    watch: asked after every step; True commits the run and leaves it to be continued.
+    watch: called after every step; True commits the run and stops it.
 
-    Returns a signal that came too late to stop it, after which no other training begins.
+    Returns a signal that came too late to stop the run and should stop the next one.
     """
     config, folder = job.config, RunFolder.of(job.config)
-    if folder.status != "SCHEDULED":  # where a sweep has, its failure is to be recorded
+    if folder.status != "SCHEDULED":  # else a sweep has begun it and records its failure
         choose_device(config.device)  # before anything is put aside or written
         import_components(config)
         if not folder.has_started:
@@ -86,7 +86,7 @@ def _labels(job: Job) -> dict[str, str]:
 
 
 def _has_ended(job: Job, folder: RunFolder) -> bool:
-    """Return whether there is nothing to train, and say so; put a run aside that is to be started over."""
+    """Return whether a run has ended, and print its result; put aside a run that is to start over."""
     config = job.config
     if folder.result is not None and has_lost_commit(folder.path):
         with folder.held():
@@ -96,19 +96,19 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
     if not sweep_goes_on(folder, job.launcher)():
         raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
     if config.resume == "must" and not folder.has_started:
-        raise ConfigError(f"resume=must: there is no run {folder.name} under {job.outputs / 'runs'}")
-    # A sweep's launcher has put aside what was there, and its next try of a job, as Slurm's, continues the run.
+        raise ConfigError(f"resume=must: no run {folder.name} under {job.outputs / 'runs'}")
+    # A sweep's launcher has already put the old run aside; its or Slurm's next try of a job continues the run.
     is_first = job.launcher is None and not job.machine.slurm_restarts
     if config.resume == "never" and is_first and folder.has_started:
         parent = folder.parent
-        print(f"the run that was here is kept as {folder.put_aside()}")
+        print(f"the earlier run is kept as {folder.put_aside()}")
         if parent is not None:
             adopt(folder.path, parent)
     if (result := folder.ended(config.budget.limits)) is None:
         if folder.has_lost_checkpoints:
             raise Fault(
-                f"run {folder.name}: its checkpoints are gone from {folder.checkpoints}: put them back, or begin anew "
-                "with resume=never, which keeps what is there"
+                f"run {folder.name}: its checkpoints are gone from {folder.checkpoints}: restore them, or start over "
+                "with resume=never, which keeps the rest of the run"
             )
         return False
     how = f"{result.outcome} after {result.steps:,} steps"
@@ -116,27 +116,27 @@ def _has_ended(job: Job, folder: RunFolder) -> bool:
     limits = config.budget.limits
     unspent = [f"{key}={limit}" for key, limit in limits.items() if key not in result.spent(limits)]
     if result.outcome == "finished" and unspent:
-        print(f"\n{' '.join(unspent)} adds nothing to a plan that is over. {_begin_with(job, folder)}")
+        print(f"\n{' '.join(unspent)} has no effect: the run's plan has ended. {_begin_with(job, folder)}")
     return True
 
 
 def _initial_weights(config: Config) -> Mapping[str, torch.Tensor] | None:
-    """Return the exported weights that a training begins with; None: random ones. Raises: ConfigError, Fault."""
+    """Return the exported weights that a training begins with; None for random ones. Raises: ConfigError, Fault."""
     if config.training.pinned is None:
         return None
     folder, digits = config.training.pinned
     card, content = read_card(Path(folder))
     if not card.sha256.startswith(digits):
-        raise ConfigError(f"training.weights={config.training.weights}: the weights there are @{card.sha256[:16]}")
+        raise ConfigError(f"training.weights={config.training.weights}: its weights are @{card.sha256[:16]}")
     try:
         return build_trained_network(config, content).state_dict()
     except Fault:
         theirs = f"model={card.config.model.name}, env.size={card.config.env.size}, {card.config.objective.name}"
-        raise ConfigError(f"training.weights={folder}: another network's ({theirs})") from None
+        raise ConfigError(f"training.weights={folder}: weights of another network ({theirs})") from None
 
 
 def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progress: Progress) -> None:
-    """Bring a trainer to its run's last commit, and write down what the run is."""
+    """Restore a trainer to its run's last commit, and record config, params and tags."""
     config = job.config
     with terminal.working("reading the checkpoint and the replay memory"):
         state = trainer.checkpoints.load(trainer.memory, progress.say)
@@ -151,7 +151,7 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
             done = Counters.of(state["counters"])
         progress.say(f"continuing run {folder.name} at step {done.steps:,}")
     if config.budget.forecast != "off":
-        # Before there is anything to publish: MLflow's import at the same time took three quarters of the speed.
+        # Before there is anything to publish: importing MLflow meanwhile costs three quarters of the speed.
         _check_forecast(trainer, config, done, progress)
     if state is None:
         journal.params({key: str(value) for key, value in flatten(to_dict(config)).items()})
@@ -173,7 +173,7 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
 
 
 def _kin(job: Job, folder: RunFolder) -> str:
-    """Say which run this one would be but for its plugins, or but for a shorter plan; empty where there is none."""
+    """Return a hint at a run that differs only in its plugins or its plan's length; empty if there is none."""
     config, science = job.config, job.config.science()
     alike = folder.name.rpartition("-")[0]
     for other in all_runs(folder.path.parents[1]):
@@ -182,12 +182,12 @@ def _kin(job: Job, folder: RunFolder) -> str:
                 trained = other.trained_config
                 theirs = trained.science()
                 if config.plugins and {**theirs, "plugins": None} == {**science, "plugins": None}:
-                    return f"; {described(trained)} of run {other.name} has become {described(config)}: another run"
+                    return f"; run {other.name} used {described(trained)}, this one uses {described(config)}"
                 if _any_length(theirs) == _any_length(science) and other.result is not None:
                     parts = {"epsilon": config.epsilon, "lr_schedule": config.lr_schedule}
                     follow = [f"{kind}={each.name}" for kind, each in parts.items() if each.name not in _FIXED]
                     why = f" ({' and '.join(follow)} follow the length)" if follow else ""
-                    told = f"run {other.name}, of {other.result.steps:,} steps, is of another plan{why}"
+                    told = f"run {other.name}, of {other.result.steps:,} steps, has another plan{why}"
                     return f"; {told}: this one begins at step 0.\n{_begin_with(job, other)}"
     return ""
 
@@ -197,7 +197,7 @@ def _any_length(science: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _begin_with(job: Job, folder: RunFolder) -> str:
-    """Say by which commands a training begins with a run's weights."""
+    """Return the commands that begin a training with a run's weights."""
     weights = f"pretrained/{folder.name}"
     own = [text for text in job.overrides if not text.startswith(("budget.steps=", "budget.flops="))]
     export = command_line("export", f"run={folder.name}", f"to={weights}", f"paths.outputs={job.outputs}")
@@ -208,7 +208,7 @@ def _begin_with(job: Job, folder: RunFolder) -> str:
 def measure(
     job: Job, cores: int | None = None, said: str = "measuring how fast it goes here"
 ) -> tuple[Trainer, Forecast]:
-    """Return a training that is not begun, and its cost here with so many cores; None: with this process's."""
+    """Build a training and measure its cost on so many cores; None for those of this process."""
     config = dataclasses.replace(job.config, threads=job.config.threads or cores)
     set_up_torch(config, config.device)
     with terminal.working(said), tempfile.TemporaryDirectory() as aside:
@@ -219,7 +219,7 @@ def measure(
 
 
 def _expected(trainer: Trainer, config: Config, done: Counters) -> Forecast:
-    """Return the cost of the rest of a training here, and leave its parts as they are."""
+    """Return the cost of the rest of a training; leave its parts unchanged."""
     return forecast(
         trainer,
         capacity=config.replay.capacity,
@@ -236,17 +236,17 @@ def _check_forecast(trainer: Trainer, config: Config, done: Counters, progress: 
     progress.say(str(cost))
     if cost.shortage is not None:
         if config.budget.forecast == "refuse":
-            raise Fault(f"{cost.shortage}; budget.forecast=warn starts all the same")
+            raise Fault(f"{cost.shortage}; budget.forecast=warn starts anyway")
         progress.say(f"warning: {cost.shortage}")
 
 
 @contextmanager
 def _faults_recorded(job: Job, folder: RunFolder, journal: Journal) -> Iterator[None]:
-    """Record why the block failed; a fault also says how to continue."""
+    """Record why the block failed; add to a fault the command that continues the run."""
     try:
         yield
     except BaseException as error:
-        with suppress(OSError):  # a full disk takes no status either; the next command sees that nobody holds it
+        with suppress(OSError):  # the disk may be full; the next command sees that no process holds the run
             write_file(folder.path / TRACEBACK, traceback.format_exc().encode())
             journal.status("FAILED", str(error) or type(error).__name__)
         if isinstance(error, RunFault | OSError):
@@ -254,7 +254,7 @@ def _faults_recorded(job: Job, folder: RunFolder, journal: Journal) -> Iterator[
             raise Fault(f"run {folder.name}: {reason}; continue with: {job.command}") from error
         if job.config.compile and _is_of_compilation(error):
             reason = str(error).strip().partition("\n")[0]
-            raise Fault(f"run {folder.name}: torch.compile failed, {reason}; compile=false does without") from error
+            raise Fault(f"run {folder.name}: torch.compile failed, {reason}; set compile=false") from error
         raise
 
 
@@ -275,7 +275,7 @@ def _close(trainer: Trainer, folder: RunFolder, journal: Journal, outcome: Outco
         report = f"evaluated last at step {earlier:,} of {counters.steps:,} (evaluation.at_end=false):\n{report}"
     result = Result(outcome, counters.steps, counts, recorder.last_metrics, report, earlier)
     journal.status("KILLED" if outcome == "interrupted" else "FINISHED")
-    if outcome != "interrupted":  # while it is still published: a server is sent the result, too
+    if outcome != "interrupted":  # before publishing ends, so that a server gets the result, too
         folder.write_result(result)
     return result
 

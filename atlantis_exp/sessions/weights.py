@@ -1,4 +1,4 @@
-"""Read the weights of a stored run: of its last commit, or of its best evaluation until then."""
+"""Read a stored run's weights: of its last commit, or of its best evaluation until then."""
 
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import ARTIFACT, is_whole, read_file
@@ -11,7 +11,7 @@ from atlantis_exp.training.plan import Counters
 def stored_weights(run: RunFolder, weights: str) -> tuple[bytes, int]:
     """Return a stored run's network as safetensors, and its step; weights: `latest` or `best`. Raises: Fault.
 
-    A folder that was copied without checkpoints has the weights of its evaluations.
+    A folder without checkpoints has the weights of its evaluations.
     """
     try:
         state = Checkpoints(run.checkpoints, run.trained_config.identity()).load()
@@ -29,12 +29,12 @@ def stored_weights(run: RunFolder, weights: str) -> tuple[bytes, int]:
             return to_safetensors(learner.get("evaluated", learner["network"])), Counters.of(state["counters"]).steps
         step = min(int(state["best_step"]), Counters.of(state["counters"]).steps)
     if step < 0:
-        raise Fault(f"run {run.name} has no evaluation yet, so no best weights; weights=latest has some")
+        raise Fault(f"run {run.name} has no evaluation yet, so no best weights; use weights=latest")
     return _read(run, model_file(NETWORK, step), state.get("best_sha256", "")), step
 
 
 def _read(run: RunFolder, path: str, sha256: str) -> bytes:
-    """Return an artifact with weights. Raises: Fault."""
+    """Read an artifact with weights. Raises: Fault."""
     try:
         content = read_file(file := run.artifact(path), ARTIFACT)
     except (OSError, ValueError) as error:

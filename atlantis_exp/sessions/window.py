@@ -1,4 +1,4 @@
-"""A window in which a person plays."""
+"""Open a window for a person to play in."""
 
 import os
 from typing import TYPE_CHECKING
@@ -24,7 +24,7 @@ class Window:
             self._surface = pygame.display.set_mode((160 * scale, 210 * scale))
         except pygame.error as error:
             raise Fault(f"play needs a screen: {error}") from None
-        # Without a screen SDL draws into memory, unasked.
+        # Without a screen SDL silently draws into memory.
         if "SDL_VIDEODRIVER" not in os.environ and pygame.display.get_driver() in ("offscreen", "dummy"):
             raise Fault("play needs a screen: none was found")
         pygame.display.set_caption(f"{title}: {game.keys_in_words}")

@@ -56,7 +56,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("model@foo=cnn", "model@foo", "'model'"),
     ("sampler@samplers.foo=uniform", "sampler@samplers.foo", "'sampler@samplers."),
     ("+samplers.mine={name:uniform}", "samplers.mine", "samplers.uniform"),
-    ("~optimizer", "~optimizer", "needed; write optimizer=VALUE"),
+    ("~optimizer", "~optimizer", "required; write optimizer=VALUE"),
     ("~plugins=0.5", "~plugins=0.5", "needed"),
     ("~phase.single", "phase", "at least one phase"),
     ("phase=two_phase ~phase.first.lr", "phase.first.lr", "missing"),
@@ -198,7 +198,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("report paths.output=x", "paths.output", "'paths.outputs'"),
     ("new component.model=cnn to=x", "model=cnn", "built in"),
     ("new component.model=MyNet to=x", "model=MyNet", "lowercase letters"),
-    ("new component.model=class to=x", "model=class", "a keyword of Python"),
+    ("new component.model=class to=x", "model=class", "a Python keyword"),
     ("ui port=80", "port=80", "greater than or equal to 1024"),
 ]
 
@@ -217,7 +217,7 @@ def test_a_mistake_is_one_line_that_names_the_key_and_what_would_be_right(line: 
 
 
 def test_a_plugin_of_an_unknown_user_is_one_line_before_hydra_reads_it() -> None:
-    with pytest.raises(ConfigError, match=r"^plugins=~nobodyhere/mynet\.py: there is no such user"):
+    with pytest.raises(ConfigError, match=r"^plugins=~nobodyhere/mynet\.py: no such user"):
         located(["plugins=~nobodyhere/mynet.py"])
 
 
@@ -237,9 +237,12 @@ def test_a_plugin_of_an_unknown_user_is_one_line_before_hydra_reads_it() -> None
         ("seed=range(0,1000000000)", "seed=range(0,1000000000): more than 10,000 values"),
         ("seed=shuffle(range(0,1000000000))", "seed=shuffle(range(0,1000000000)): more than 10,000 values"),
         ("optimizer.lr=range(0,1,1e-9)", "optimizer.lr=range(0,1,1e-9): more than 10,000 values"),
-        ("seed=range(0,5000) model=cnn,resnet,resnet_fast", "these values make 15,000 jobs, more than 10,000: name"),
-        (f"env.crop={'[' * 500}1{']' * 500}", f"env.crop={'[' * 51}...: lists within lists, too deep to be read"),
-        ("hydra/launcher=null", "hydra/launcher=null: use only hydra/launcher=NAME"),
+        (
+            "seed=range(0,5000) model=cnn,resnet,resnet_fast",
+            "these values make 15,000 jobs; write values for at most 10,000",
+        ),
+        (f"env.crop={'[' * 500}1{']' * 500}", f"env.crop={'[' * 51}...: lists nested too deeply"),
+        ("hydra/launcher=null", "hydra/launcher=null: of Hydra's keys, only"),
         (
             "hydra/launcher=joblib hydra.launcher.n_jobs=0",
             "hydra.launcher.n_jobs=0: write the number of jobs at a time",
@@ -254,7 +257,7 @@ def test_a_sweep_that_cannot_be_is_one_line(line: str, reason: str) -> None:
 @pytest.mark.parametrize("line", ["seed=1 seed=2", "model=cnn model=resnet", "-m seed=0,1 seed=2", "+seed=1 ++seed=2"])
 def test_a_key_given_twice_is_refused(line: str) -> None:
     *_, first, second = (word.lstrip("+") for word in line.split())
-    with pytest.raises(ConfigError, match=f"^{re.escape(second)}: {re.escape(first)} says something else"):
+    with pytest.raises(ConfigError, match=f"^{re.escape(second)}: contradicts {re.escape(first)}"):
         refuse_twice(line.split())
     refuse_twice([first, first])
 

@@ -14,7 +14,7 @@ from atlantis_exp.faults import ConfigError
         ("to=http://me:secret@127.0.0.1", "to: should be null or a server's address"),
         ("every=soon", "every=soon: not a duration"),
         ("every=99999999999999h", "every=99999999999999h: should be at most 10 years"),
-        ("tracking=none", "tracking=none: names no store"),
+        ("tracking=none", "tracking=none: has no store"),
         ("form=http://127.0.0.1:5000", "form=http://127.0.0.1:5000: no such key"),
     ],
 )

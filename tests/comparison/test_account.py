@@ -124,7 +124,7 @@ def test_a_pair_of_several_groups_has_their_verdict_and_its_share_of_their_error
     runs = Runs()
     whole, _ = runs.ask("whole", "abcd")
     pair, account = runs.ask("pair", "cb")
-    assert account.lines == ["By model, this continues the looks of whole, of whose 6 pairs it is a part."]
+    assert account.lines == ["By model, this continues the looks of whole, which has 6 pairs in all."]
     (verdict,) = pair.decision.verdicts
     assert verdict == next(each for each in whole.decision.verdicts if (each.group, each.other) == ("b", "c"))
     assert pair.decision.spent == pytest.approx(0.0125 / 6)
@@ -170,12 +170,12 @@ def test_more_groups_than_were_asked_are_told_what_was_spent() -> None:
     runs.ask("two", "ab")
     _, account = runs.ask("three", "abc")
     (line,) = account.lines
-    assert line.startswith("These runs have been asked 1 other question, which spent 1.25%;")
+    assert line.startswith("1 other question about these runs spent 1.25% of error;")
     runs.ask("others", "cd")
     _, account = runs.ask("four", "abcd")
-    assert account.lines[0].startswith("These runs have been asked 3 other questions, which spent 3.75%;")
+    assert account.lines[0].startswith("3 other questions about these runs spent 3.75% of error;")
     _, account = runs.ask("two", "ab")
-    assert account.lines[0].startswith("These runs have been asked 2 other questions, which spent 2.50%;")
+    assert account.lines[0].startswith("2 other questions about these runs spent 2.50% of error;")
 
 
 def test_another_delta_is_another_question_and_is_told() -> None:
@@ -183,7 +183,7 @@ def test_another_delta_is_another_question_and_is_told() -> None:
     runs.ask("plain", "ab")
     other, account = runs.ask("equal", "ab", delta=100.0)
     assert other.decision.spent == 0.0125
-    assert account.lines[0].startswith("These runs have been asked 1 other question")
+    assert account.lines[0].startswith("1 other question about these runs")
 
 
 def test_other_runs_of_the_same_groups_are_another_question_and_are_told() -> None:
@@ -192,7 +192,7 @@ def test_other_runs_of_the_same_groups_are_another_question_and_are_told() -> No
     other, account = runs.ask("other", "ab", range(5, 10), words="z")
     assert other.decision.looks[0].seeds["za"] == [5, 6, 7, 8, 9]
     assert other.decision.spent == 0.0125
-    assert [line[:42] for line in account.lines] == ["These runs have been asked 1 other questio"]
+    assert [line[:31] for line in account.lines] == ["1 other question about these ru"]
 
 
 def test_a_smaller_error_than_was_spent_does_not_go_on() -> None:
@@ -200,7 +200,7 @@ def test_a_smaller_error_than_was_spent_does_not_go_on() -> None:
     runs.ask("loose", "ab", range(10), error=0.5)
     strict, account = runs.ask("strict", "ab", range(10))
     assert strict.decision.spent == pytest.approx(0.05)
-    assert account.lines[0].startswith("These runs have been asked 1 other question, which spent 50.00%;")
+    assert account.lines[0].startswith("1 other question about these runs spent 50.00% of error;")
 
 
 def test_a_question_that_looked_for_itself_keeps_its_looks() -> None:
@@ -218,7 +218,7 @@ def test_an_unplanned_look_at_a_part_is_told_to_the_whole() -> None:
     runs.ask("whole", "abd")
     runs.ask("pair", "ab", range(8), now=True)
     _, account = runs.ask("whole", "abd", range(10))
-    assert account.lines[0].startswith("These runs have been asked 1 other question, which spent ")
+    assert account.lines[0].startswith("1 other question about these runs spent ")
 
 
 def test_runs_that_were_compared_before_and_are_gone_are_named() -> None:

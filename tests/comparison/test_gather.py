@@ -202,12 +202,12 @@ def test_a_run_that_is_being_made_longer_does_not_count(recorded: Recorded, tmp_
     folder.write_config({**tree, "budget": {**tree["budget"], "steps": 320}})
     gathered = gather(tmp_path)
     assert gathered.trainings == []
-    assert gathered.skipped[folder.name].startswith("unfinished: it was made longer")
+    assert gathered.skipped[folder.name].startswith("unfinished: its limits were raised")
 
 
 def test_a_run_that_ended_before_its_arithmetic_was_spent_does_not_count(recorded: Recorded, tmp_path: Path) -> None:
     folder = RunFolder(recorded("budget.flops=3001", outcome="budget", updates=30))  # of 100 FLOPs each
-    assert gather(tmp_path).skipped[folder.name].startswith("unfinished: it was made longer")
+    assert gather(tmp_path).skipped[folder.name].startswith("unfinished: its limits were raised")
 
 
 def test_players_are_there_whichever_trainings_are_asked_for(recorded: Recorded, tmp_path: Path) -> None:

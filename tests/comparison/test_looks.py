@@ -50,7 +50,7 @@ def test_looks_are_read_as_they_were_written(tmp_path: Path) -> None:
 
 def test_a_record_that_is_gone_from_a_comparison_that_was_made_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text("{}")
-    with pytest.raises(Fault, match=r"looks.json is gone: restore it, for without it the error"):
+    with pytest.raises(Fault, match=r"looks.json is gone: restore it, since without it the error"):
         read_looks(tmp_path, asked())
 
 
@@ -67,8 +67,8 @@ def seeds(name: str, chosen: list[int]) -> Callable[[dict[str, Any]], None]:
     return lambda record: record["model"][0]["seeds"].update({name: chosen})
 
 
-PAIRS, NUMBERS = "are at other pairs", "are at impossible numbers"
-ERROR, SAID = "spent another error than the plan lets them", "say what their intervals do not"
+PAIRS, NUMBERS = "are about other pairs", "have impossible numbers"
+ERROR, SAID = "spent another error than the plan allows", "contradict their intervals"
 
 
 @pytest.mark.parametrize(

@@ -112,7 +112,7 @@ def test_the_score_is_survival_times_rate_and_the_rate_is_the_sum_of_what_paid(
     assert cnn["side_vessel"] > 0 == resnet["side_vessel"]  # NOOP and FIRE are the first two actions
     (note,) = (note for note in comparison.notes if "by survival" in note)
     whole, survival, rate = (float(text.replace(",", "")) for text in re.findall(r"[+-][\d,]+", note))
-    assert note.startswith("The mean of cnn less that of resnet is ")
+    assert note.startswith("The mean of cnn minus that of resnet is ")
     assert whole == pytest.approx(cnn["mean"] - resnet["mean"], abs=0.51)
     assert survival + rate == pytest.approx(whole, abs=1.51)
     middle = (cnn["points_per_1000_frames"] + resnet["points_per_1000_frames"]) / 2_000
@@ -244,7 +244,7 @@ def test_the_time_cap_is_named_where_it_decides(compared: Callable[..., Comparis
 def test_early_scores_below_random_come_with_the_reason(compared: Callable[..., Comparison]) -> None:
     early = "at 5 M frames published DQN is at 7,000 to 9,000"
     assert any(
-        note.startswith(f"Scores below the random player's are normal so early: {early}") for note in compared().notes
+        note.startswith(f"Scores below the random player's are normal this early: {early}") for note in compared().notes
     )
     means = [row["mean"] for row in curves(ATLANTIS) if row["name"].startswith("DQN") and row["frames"] == 5e6]
     assert 7_000 < min(means) < max(means) < 9_000
@@ -252,7 +252,7 @@ def test_early_scores_below_random_come_with_the_reason(compared: Callable[..., 
 
 def test_a_late_curve_has_the_published_ones_next_to_it_and_no_excuse(compared: Callable[..., Comparison]) -> None:
     comparison = compared(curve=((0, 0, 0, 0), (12_000_000, 9, 9, 9_000)))
-    assert not any("normal so early" in note for note in comparison.notes)
+    assert not any("normal this early" in note for note in comparison.notes)
     assert {row["frames"] for row in comparison.tables["published_curves"]} == {1e6 * n for n in range(1, 11)}
 
 

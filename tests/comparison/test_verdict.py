@@ -221,7 +221,7 @@ def test_unbalanced_groups_and_seeds_are_left_out_of_a_keys_answer_and_named() -
     assert list(sampler.seeds["top_half"]) == [0, 1, 2, 3]
     caveats = " ".join(comparison.caveats)
     assert "By model, groups without a counterpart for every value are left out: cnn top_half" in caveats
-    assert "By sampler, top_half goes without seed 4, which not all of its groups have." in caveats
+    assert "By sampler, top_half is averaged without seed 4, which not all of its groups have." in caveats
 
 
 def test_keys_that_share_no_value_are_not_answered_by_themselves() -> None:
@@ -259,7 +259,7 @@ def test_a_baseline_may_be_a_value_of_a_key_or_a_group_and_nothing_else() -> Non
     assert alone.family.plan.baseline == "cnn uniform"
     with pytest.raises(ConfigError, match=r"^baseline=cnm: no such group; did you mean 'cnn'\? \(valid: cnn, cnn top"):
         compared(runs, "model", "sampler", baseline="cnm")
-    with pytest.raises(ConfigError, match=r"^baseline=cnn: there is one group only"):
+    with pytest.raises(ConfigError, match=r"^baseline=cnn: there is only one group"):
         compared(runs[:5], baseline="cnn")
 
 
@@ -312,8 +312,7 @@ def test_looks_are_taken_where_they_are_planned_and_the_same_seeds_charge_nothin
     assert "5 seeds each); next look at 10 seeds (there are 7 each)." in between.verdict
     assert "more seeds" not in between.verdict
     assert (
-        "Verdicts rest on the seeds of their looks, scores are of all seeds there are: cnn has 7, resnet has 7."
-        in between.caveats
+        "Verdicts use the seeds of their looks, scores all existing seeds: cnn has 7, resnet has 7." in between.caveats
     )
 
     last = compared(runs(seeds), record=record_of(between))
@@ -350,7 +349,7 @@ def test_a_look_that_nobody_planned_is_charged_and_said() -> None:
 def test_what_would_have_been_found_is_not_said_of_seeds_that_do_not_differ() -> None:
     runs = [of(model, seed, (2_000.0,) * 4) for model in ("cnn", "resnet") for seed in range(5)]
     last = compared(runs, seeds=5).verdict
-    assert last.endswith("the detectable difference is unknown, for seeds do not differ.")
+    assert last.endswith("the detectable difference is unknown, since seeds do not differ.")
     assert "80 %" not in last
 
 
@@ -454,9 +453,7 @@ def test_collapsed_policies_and_equal_scores_are_named() -> None:
 def test_runs_of_a_look_that_are_gone_or_score_otherwise_are_named() -> None:
     runs = [*around("cnn", 3_000.0, range(6)), *around("resnet", 5_000.0, range(6))]
     record = {each.family.name: each.decision.looks for each in compared(runs[:5] + runs[6:11]).answers}
-    said = (
-        "By model, runs of past looks are gone or have other scores now, and their verdicts stay: cnn against resnet."
-    )
+    said = "By model, runs of past looks are gone or have new scores, but their verdicts stay: cnn against resnet."
     assert said not in compared(runs, record=record).caveats
     for others in ([of("resnet", 2, (1.0,) * 4)], []):
         comparison = compared([*runs[:8], *others, *runs[9:]], record=record)
@@ -504,10 +501,10 @@ def test_seeds_that_a_group_has_lost_are_named_next_to_its_verdict() -> None:
     gathered = Gathered(runs, lost=[lost("cnn", 5), lost("cnn", 6), lost("resnet", 4), lost("tiny", 0)])
     caveats = compare(gathered, group(runs, ["model"]), Question(["model"])).caveats
     assert [line for line in caveats if " lacks " in line] == [
-        "cnn lacks 2 seeds, unfinished or unusable: cnn-uniform-s5, cnn-uniform-s6. If how it played is the reason, "
-        "the others do not stand for it.",
-        "tiny lacks 1 seed, unfinished or unusable: tiny-uniform-s0. If how it played is the reason, the others do "
-        "not stand for it.",
+        "cnn lacks 2 seeds, unfinished or unusable: cnn-uniform-s5, cnn-uniform-s6. If scores are the reason, "
+        "the other seeds are not representative.",
+        "tiny lacks 1 seed, unfinished or unusable: tiny-uniform-s0. If scores are the reason, the other seeds "
+        "are not representative.",
     ]
 
 
@@ -600,14 +597,14 @@ def test_runs_that_were_asked_before_go_on_with_their_looks_and_are_told_of_othe
 ) -> None:
     for model, score in (("cnn", 3_000.0), ("resnet", 3_015.0), ("resnet_fast", 9_000.0)):
         first, *_ = record_seeds(model, score)
-    assert "have been asked" not in run("runs=cnn,resnet-", "seeds=5")
+    assert "about these runs" not in run("runs=cnn,resnet-", "seeds=5")
     shown = run("runs=resnet-,cnn", "seeds=20")
     assert "By model, this continues the looks of cnn-vs-resnet-" in shown
     assert "5.00% of 5.00%" in shown
-    assert "These runs have been asked 1 other question, which spent 5.00%;" in (whole := run())
+    assert "1 other question about these runs spent 5.00% of error;" in (whole := run())
     shutil.rmtree(first)
     assert f"Compared before, and gone or left out now: {first.name}." in run()
-    assert "of whose 3 pairs it is a part" in run("runs=cnn,resnet_fast")
+    assert "which has 3 pairs in all" in run("runs=cnn,resnet_fast")
     assert "cannot be read" not in whole
     broken = next((tmp_path / "comparisons").glob("cnn-vs-resnet-vs-*")) / "looks.json"
     broken.write_text("{}"[:1])
@@ -719,11 +716,11 @@ def test_runs_are_told_apart_by_the_device_that_auto_has_become(
 @pytest.mark.parametrize(
     ("word", "line"),
     [
-        ("baseline=cnm", "baseline=cnm: there is one group only"),
+        ("baseline=cnm", "baseline=cnm: there is only one group"),
         ("delta=-5%", "delta=-5%: write a share of a score, as in delta=5%, or points, as in delta=500"),
         ("delta=0", "delta=0: write"),
         ("runs=cnn,resnt", "runs=resnt: no such run under "),
-        ("where=env.crop=[1,2,3,4],model=cnn", "there is no finished training under "),
+        ("where=env.crop=[1,2,3,4],model=cnn", "no finished training under "),
         ("seeds=4", "seeds=4: should be greater than or equal to 5"),
         ("error=1", "error=1: should be less than 1"),
         ("look=later", "look=later: no such choice; no valid choice is near (valid: due, now)"),
@@ -740,9 +737,9 @@ def test_a_verdict_says_its_condition_and_its_size_where_a_look_found_it() -> No
     found = compared(around("a", 1_000, range(10)) + around("b", 950, range(10)))
     (line,) = (note for note in found.caveats if "collapsed" in note)
     assert line.startswith("a against b: ")
-    assert re.search(r"the true difference is rather (4\d|50) points\.", line)
+    assert re.search(r"the true one is rather (4\d|50) points\.", line)
     assert "would not hold if 5% of the seeds of a collapsed" in line
-    assert re.search(r"1\.0 times as much .* leave up to (26|45)% possible", line)
+    assert re.search(r"1\.0 times as much .* cannot exclude up to (26|45)%", line)
     assert not [note for note in compared(around("a", 1_000) + around("b", 1_000)).caveats if "collapsed" in note]
 
 
@@ -778,17 +775,17 @@ def test_an_open_pair_says_how_often_a_seed_wins_and_the_seeds_that_such_a_diffe
     assert any(re.match(rf"{beats}\.$", line) for line in decided)
 
 
-def test_an_open_pair_says_which_group_is_no_worse_by_more_than_delta() -> None:
+def test_an_open_pair_says_which_group_is_worse_by_at_most_delta() -> None:
     runs = [*around("a", 1_000), *around("b", 1_040)]
 
     def said(**question: Any) -> list[str]:
         caveats = compared(runs, error=0.01, **question).caveats
-        return [part for line in caveats for part in line.rstrip(".").split("; ") if "no worse by" in part]
+        return [part for line in caveats for part in line.rstrip(".").split("; ") if part.endswith(" worse")]
 
     assert said() == []
-    assert said(delta=60.0) == ["b is no worse by more than 60 points"]
-    assert said(delta=0.06, relative=True) == ["b is no worse by more than 6 %"]
-    assert said(delta=0.06, relative=True, baseline="b") == ["b is no worse by more than 6 %"]
+    assert said(delta=60.0) == ["b is at most 60 points worse"]
+    assert said(delta=0.06, relative=True) == ["b is at most 6 % worse"]
+    assert said(delta=0.06, relative=True, baseline="b") == ["b is at most 6 % worse"]
     (verdict,) = compared(runs, error=0.01, baseline="b").tables["verdict"]
     assert said(delta=verdict["high"] / 1_028, relative=True, baseline="b")  # b's mean is 1,038, both's 1,018
     assert said(delta=5.0) == []
@@ -797,5 +794,5 @@ def test_an_open_pair_says_which_group_is_no_worse_by_more_than_delta() -> None:
 
 def test_a_seed_that_one_group_lacks_below_its_others_is_named() -> None:
     runs = [*around("a", 1_000, (0, 1, 3, 4, 5)), *around("b", 1_000, range(8))]
-    (line,) = (line for line in compared(runs).caveats if "goes without seed" in line)
-    assert line.startswith("a goes without seed 2, which others have.")
+    (line,) = (line for line in compared(runs).caveats if " lacks seed " in line)
+    assert line.startswith("a lacks seed 2, which others have.")

@@ -53,7 +53,7 @@ def folder(tiny: Compose, tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("key", "value", "line"),
     [
-        ("sha256", "0" * 64, "does not have the checksum of its card"),
+        ("sha256", "0" * 64, "does not match the checksum in its card"),
         ("config.env.size", 84, "another network's"),
         ("config.env.siz", 40, "card.json: config.env.siz: no such key; did you mean 'size'?"),
         ("config.model._target_", "os.system", "card.json: config.model._target_: no such key"),
@@ -162,7 +162,7 @@ def test_a_folder_of_this_place_is_named_without_a_path(folder: Path, monkeypatc
     monkeypatch.chdir(folder.parent)
     ((_, config),) = check("evaluate", EvaluateConfig, ["weights=untrained"]).items()
     assert config.weights == "untrained"
-    with pytest.raises(ConfigError, match="weights=untraind: neither"):
+    with pytest.raises(ConfigError, match="weights=untraind: not a folder"):
         check("evaluate", EvaluateConfig, ["weights=untraind"])
 
 

@@ -113,7 +113,7 @@ def test_what_follows_from_the_seed_makes_no_other_comparison_and_another_recipe
         (("env.crop=[0,160,210,0]",), (), "env.crop differs, so the scores do not mean the same: "),
         (("evaluation.epsilon=0.3",), (), "evaluation.epsilon differs"),
         ((), ("by=modle",), "by=modle: no such key"),
-        ((), ("where=seed=5",), "there is no finished training"),
+        ((), ("where=seed=5",), "no finished training"),
         ((), ("at_epsilon=2",), "at_epsilon=2: should be less"),
         ((), ("seed=2",), "seed=2: no such key; did you mean 'seeds'"),
     ],
@@ -238,7 +238,7 @@ def test_what_is_asked_of_runs_is_refused_with_a_table_of_scores(
     with pytest.raises(SystemExit, match="2"):
         VERB.run([f"paths.outputs={tmp_path}", f"scores={tmp_path / 's.csv'}", word])
     key = word.partition("=")[0]
-    assert capsys.readouterr().err.startswith(f"atlantis_exp: {key}: is of runs, not of scores=")
+    assert capsys.readouterr().err.startswith(f"atlantis_exp: {key}: applies to runs, not to scores=")
 
 
 @pytest.mark.parametrize("columns", ["return", "score=", "points=return"])

@@ -100,7 +100,7 @@ def test_contenders_are_trained_level_until_a_look_decides_and_compare_says_the_
     assert [look["error"] for look in before["env.max_steps"]] == [0.05]
 
     again = shlex.split(contest.comparing)
-    assert f"its runs again: {contest.comparing}" in printed
+    assert f"compare its runs again: {contest.comparing}" in printed
     assert again[:4] == ["python", "-m", "atlantis_exp", "compare"]
     COMPARE.run([*again[4:], "tracking=none"])
     assert answer in capsys.readouterr().out.splitlines()
@@ -156,7 +156,7 @@ def test_what_stops_a_training_stops_its_decision_with_the_same_code(
     asking: Asking, capsys: pytest.CaptureFixture[str]
 ) -> None:
     contest = asking("model=cnn,resnet", "seeds=5")
-    again = f"the decision goes on with: {contest.command}"
+    again = f"continue the decision with: {contest.command}"
     cases: list[tuple[BaseException | int | None, int, str, str]] = [
         (SystemExit(143), 143, "KILLED", ""),
         (KeyboardInterrupt(), 130, "KILLED", ""),
@@ -197,17 +197,17 @@ def test_a_plan_whose_error_is_spent_trains_nothing_and_says_how_to_go_on(
 
     for model in ("cnn", "resnet"):
         record_seeds(recorded, 1_000, range(10), f"model={model}")
-    for seeds, left in ((10, ""), (20, "Nothing is left of error=0.05 for a look at 20 seeds, so none is trained. ")):
+    for seeds, left in ((10, ""), (20, "error=0.05 is spent, so seeds for a look at 20 are not trained. ")):
         decide(asking("model=cnn,resnet", f"seeds={seeds}"), train)
         shown = capsys.readouterr().out
         assert "Not decided: cnn against resnet" in shown
         assert "is found" not in shown  # a forecast
-        assert ("Nothing is left" in shown) == bool(left)
+        assert ("is spent" in shown) == bool(left)
         assert left in shown
     contest = asking("model=cnn,resnet", "seeds=20", "error=0.1")
     with pytest.raises(AssertionError):
         decide(contest, train)
-    assert "of the score is found with 80 % at 20 seeds" in " ".join(capsys.readouterr().out.split())
+    assert "of the score is found with a probability of 80 % at 20 seeds" in " ".join(capsys.readouterr().out.split())
 
 
 def test_several_keys_at_once_are_two_contenders(asking: Asking) -> None:
@@ -231,7 +231,9 @@ def test_a_run_that_cannot_be_compared_is_named(asking: Asking, recorded: Record
     run = contest.run("resnet", 3)
     (table,) = run.path.glob("artifacts/evaluation/*.csv")
     table.unlink()
-    with pytest.raises(Fault, match=f"^run {run.name} has ended and cannot be compared; above it says why$"):
+    with pytest.raises(
+        Fault, match=f"^run {run.name} has ended but cannot be compared, as the warning above explains$"
+    ):
         decide(contest)
 
 
@@ -241,7 +243,7 @@ def test_a_run_that_was_trained_longer_than_is_asked_is_no_seed_of_the_question(
     record_seeds(recorded, 1_000, range(5), "model=cnn")
     longer = recorded("model=resnet", "seed=3", "budget.steps=161", outcome="budget", steps=161)
     line = (
-        f"^budget.steps=160: run {longer.name} was trained for 161 steps; ask for as many, or for other paths.outputs$"
+        f"^budget.steps=160: run {longer.name} was trained for 161 steps; ask for as many, or name other paths.outputs$"
     )
     with pytest.raises(ConfigError, match=line):
         asking("model=cnn,resnet", "budget.steps=160")
@@ -288,7 +290,7 @@ def test_contenders_that_explore_differently_are_refused_by_the_training_score_b
     asking: Asking,
 ) -> None:
     asking("epsilon=constant", "epsilon.value=0.1,0.2")
-    with pytest.raises(ConfigError, match=r"^score=training: contenders differ in epsilon, .*; use score=last$"):
+    with pytest.raises(ConfigError, match=r"^score=training: depends on epsilon, .*; use score=last$"):
         asking("epsilon=constant", "epsilon.value=0.1,0.2", "score=training")
 
 
@@ -313,26 +315,25 @@ def test_before_it_starts_it_says_how_many_runs_there_may_be_and_what_they_can_f
     contest = asking("model=cnn,resnet_fast", "delta=5%")
     contest.here = Launcher("joblib", {"n_jobs": 4, "cores": 2})
     assert said(contest, capsys).splitlines() == [
-        "cnn, resnet_fast: 10 to 20 runs, looks at 5 and 10 seeds each; 0 are there.",
+        "cnn, resnet_fast: 10 to 20 runs, looks at 5 and 10 seeds each; 0 exist.",
         "4 trainings at a time, 2 cores each",
-        "a difference of 12 % of the score is found, and no difference where delta is 14 % or more, with 80 % at 10 "
-        "seeds",
-        "(if a contender's seeds differ as published ones do (Dopamine's agents, five seeds): 9 % of their mean, "
-        "standard deviation)",
+        "a difference of 12 % of the score is found, and no difference where delta is 14 % or more, with a "
+        "probability of 80 % at 10 seeds",
+        "(if the standard deviation over seeds is 9 % of the mean, as in published runs (Dopamine's, five seeds))",
     ]
     record_seeds(recorded, 1_000, range(2), "model=cnn")
     assert "published" in said(contest, capsys)
     for seed, score in ((2, 900.0), (3, 1_100.0)):
         recorded("model=cnn", f"seed={seed}", scores=(score, score, score, score))
     assert said(contest, capsys).splitlines() == [
-        "cnn, resnet_fast: 10 to 20 runs, looks at 5 and 10 seeds each; 4 are there.",
+        "cnn, resnet_fast: 10 to 20 runs, looks at 5 and 10 seeds each; 4 exist.",
         "4 trainings at a time, 2 cores each",
-        "a difference of 11 % of the score is found, and no difference where delta is 13 % or more, with 80 % at 10 "
-        "seeds",
-        "(if a contender's seeds differ as those that are there do: 8 % of their mean, standard deviation)",
+        "a difference of 11 % of the score is found, and no difference where delta is 13 % or more, with a "
+        "probability of 80 % at 10 seeds",
+        "(if the standard deviation over seeds is 8 % of the mean, as in the existing runs)",
     ]
     shown = said(asking("model=cnn,resnet_fast", "sampler=uniform,top_half", "seeds=5"), capsys).splitlines()
-    assert shown[0].endswith("20 runs, looks at 5 seeds each; 4 are there.")
+    assert shown[0].endswith("20 runs, looks at 5 seeds each; 4 exist.")
     assert [line.partition(" is found")[0] for line in shown[2:-1]] == [
         "by model, a difference of 14 % of the score",
         "by sampler, a difference of 14 % of the score",
@@ -348,11 +349,11 @@ def test_before_it_starts_it_says_what_hours_the_runs_take(asking: Asking, capsy
     assert "one training after the other" in shown
     assert re.search(r"^ *cnn: [\d,]+ (seconds|minutes) a run, alone on this machine", shown, re.MULTILINE)
     assert re.search(r"resnet_fast: [\d,]+ (seconds|minutes) a run, alone on this machine", shown)
-    assert re.search(r"at most [\d,]+ (seconds|minutes) where they run one after the other", shown)
+    assert re.search(r"at most [\d,]+ (seconds|minutes) one after the other", shown)
     contest.here = Launcher("joblib", {"n_jobs": 4, "cores": 1})
     shown = said(contest, capsys)
     assert re.search(r"^ *cnn: [\d,]+ (seconds|minutes) a run, on its share", shown, re.MULTILINE)
-    assert re.search(r"at most [\d,]+ (seconds|minutes) so many at a time, evaluations not counted", shown)
+    assert re.search(r"at most [\d,]+ (seconds|minutes) side by side, evaluations not counted", shown)
 
 
 @pytest.mark.slow
@@ -376,7 +377,7 @@ def test_a_decision_that_was_killed_goes_on_and_ends_as_the_unbroken_one(
         out, error = process.communicate()
         assert process.returncode == ended, out + error
         if ended > 0:
-            assert "atlantis_exp: the decision goes on with: python -m atlantis_exp decide" in error
+            assert "atlantis_exp: continue the decision with: python -m atlantis_exp decide" in error
             assert "Traceback" not in error
             (folder,) = (tmp_path / "o" / "decisions").iterdir()
             assert RunFolder(folder).status == "KILLED"

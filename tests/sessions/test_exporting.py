@@ -90,9 +90,7 @@ def test_an_export_of_what_began_with_weights_says_which_and_not_where(
     assert str(tmp_path) not in (folder / "card.json").read_text()
     gathered = gather(tmp_path / "second")
     notes = compare(gathered, group(gathered.trainings, ["model"]), Question(["model"])).notes
-    assert (
-        f"cnn began with {config.training.weights}; what that took counts in no frames, hours or arithmetic." in notes
-    )
+    assert f"cnn began with {config.training.weights}; frames, hours and FLOPs do not include their training." in notes
 
 
 def test_weights_that_no_training_can_begin_with_are_one_line_and_leave_nothing(
@@ -112,8 +110,8 @@ def test_weights_that_no_training_can_begin_with_are_one_line_and_leave_nothing(
     assert refused(f"training.weights={exported}x") == (
         f"x: not a folder of exported weights; did you mean '{exported}'? (valid: {exported})\n"
     )
-    assert refused(f"training.weights='{exported}@{16 * '0'}'") == f"@{16 * '0'}: the weights there are @{digest}\n"
-    theirs = ": another network's (model=cnn, env.size=40, dqn)\n"
+    assert refused(f"training.weights='{exported}@{16 * '0'}'") == f"@{16 * '0'}: its weights are @{digest}\n"
+    theirs = ": weights of another network (model=cnn, env.size=40, dqn)\n"
     assert refused(f"training.weights={exported}", "model=resnet_fast") == theirs
     assert refused(f"training.weights='{exported}@{digest}'", "env.size=44") == theirs
     (exported / "card.json").write_text("{}")

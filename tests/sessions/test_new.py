@@ -61,8 +61,8 @@ def test_what_is_written_keeps_every_contract(
         (["to=x"], "new: name one component"),
         (["model=mynet", "sampler=mine", "to=x"], "new: name one component"),
         (["model=MyNet", "to=x"], "model=MyNet: a name has lowercase letters"),
-        (["model=class", "to=x"], "model=class: is a keyword of Python"),
-        (["model=cnn", "to=x"], "model=cnn: is built in and is not replaced"),
+        (["model=class", "to=x"], "model=class: is a Python keyword"),
+        (["model=cnn", "to=x"], "model=cnn: is built in and cannot be replaced"),
     ],
 )
 def test_a_package_that_cannot_be_is_one_line(

@@ -36,6 +36,6 @@ def test_the_query_says_what_this_config_makes_of_the_environment(capsys: pytest
     assert "an episode ends: when the game is over, or after 27,000 steps or 108,000 frames" in report
     assert "rows 16-95, columns 0-159" in report
     standard = "\n".join(answer(capsys, "env=atlantis_standard", "env.sticky=0.5"))
-    assert "frames a step: 4" in standard
+    assert "frames per step: 4" in standard
     assert "probability 0.5" in standard
     assert "an episode ends: when the game is over, or after 108,000 frames" in standard

@@ -16,7 +16,7 @@ def test_a_report_on_an_empty_folder_says_so_and_creates_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     report(tmp_path / "nothing")
-    assert capsys.readouterr().out == f"there is no run under {tmp_path}/nothing/runs yet\n"
+    assert capsys.readouterr().out == f"no run under {tmp_path}/nothing/runs yet\n"
     assert not (tmp_path / "nothing").exists()
 
 

@@ -114,7 +114,7 @@ def test_a_signal_that_comes_when_a_trial_has_nothing_left_to_stop_ends_the_sear
     request = searching("trials=2", space=SPACE[1:])
     with pytest.raises(SystemExit, match="143"):
         search(request, trained)
-    assert capsys.readouterr().err.endswith(f"SIGTERM: the search goes on with: {request.command}\n")
+    assert capsys.readouterr().err.endswith(f"SIGTERM: continue the search with: {request.command}\n")
     assert [trial.state.name for trial in Trials(request).all] == ["COMPLETE"]
 
 
@@ -307,7 +307,7 @@ def test_a_trial_that_fails_is_recorded_and_the_search_goes_on(
 
 
 def test_a_search_without_a_trial_that_was_trained_to_its_end_says_so(searching: Searching) -> None:
-    with pytest.raises(Fault, match="no trial was trained to its end; 0 of 20 trials"):
+    with pytest.raises(Fault, match="no trial finished; 0 of 20 trials"):
         trials_of(searching).print_results()
 
 
@@ -324,7 +324,7 @@ def test_a_run_that_went_on_beyond_the_budget_is_no_result_of_a_search_within_it
 
 def test_a_name_is_one_searchs(searching: Searching) -> None:
     trials_of(searching, "name=mine", space=("optimizer=choice(adam)",))
-    with pytest.raises(ConfigError, match="name=mine: was begun for another space or another training"):
+    with pytest.raises(ConfigError, match="name=mine: is a search of another space or training"):
         trials_of(searching, "name=mine", "env.size=48", space=("optimizer=choice(adam)",))
 
 
@@ -333,7 +333,7 @@ def test_at_the_end_of_its_time_a_search_leaves_its_trial_to_be_continued(search
     for seconds in (2, 8, 32):  # which can be over before a first trial, where other programs want the machine
         request = searching(f"budget.wall_clock={seconds}s", "phase.quick.steps=100_000")
         with pytest.raises(
-            Fault, match="the search goes on with: python -m atlantis_exp search experiment=quick"
+            Fault, match="continue the search with: python -m atlantis_exp search experiment=quick"
         ) as caught:
             search(request)
         assert caught.value.exit_code == 124
@@ -348,7 +348,7 @@ def test_at_the_end_of_its_time_a_search_leaves_its_trial_to_be_continued(search
 
 
 def started(request: Search) -> "subprocess.Popen[str]":
-    """A process of the command that a search says it goes on with."""
+    """A process of the command that a search says continues it."""
     return subprocess.Popen(
         (sys.executable, *shlex.split(request.command)[1:]),
         cwd=REPOSITORY,
@@ -389,7 +389,7 @@ def test_a_search_that_is_interrupted_and_killed_is_the_unbroken_one(searching: 
         _, errors = process.communicate()
         assert process.returncode == (130 if number == signal.SIGINT else -9)
         if number == signal.SIGINT:
-            assert "the search goes on with: python -m atlantis_exp search" in errors
+            assert "continue the search with: python -m atlantis_exp search" in errors
     process = started(request)
     out, errors = process.communicate()
     assert process.returncode == 0, errors

@@ -76,7 +76,7 @@ def test_a_page_tells_of_each_run_how_far_it_is_and_why_it_failed(
     assert (page.status, page.title) == ("FAILED", "sweep seed=0,1,2,3,4")
     assert page.error == f"2 of 5 runs failed\n{failed.name}: no device\n{unsaid.name}: no space"
     assert note_of(page).splitlines() == [
-        "- **cnn uniform s2 failed**: no device (`traceback.txt` of the run tells all)",
+        "- **cnn uniform s2 failed**: no device (details in `traceback.txt` of the run)",
         "- **cnn uniform s3 failed**: no space",
         "",
         "| run | state | steps | mean | +- | median | IQM | high | low | hours |",

@@ -245,7 +245,7 @@ def test_it_looks_again_and_says_only_what_changed_until_it_is_interrupted(
     assert first.endswith(": 2 runs: 2 published\n")
     assert second == ""
     assert "1 failed, 1 up to date" in third
-    assert third.endswith("1 of 2 runs failed; looking again in 30s\n")
+    assert third.endswith("1 of 2 runs failed; trying again in 30s\n")
 
 
 def test_a_store_that_fails_in_the_middle_ends_it_and_a_folder_that_fails_does_not(tmp_path: Path) -> None:

@@ -90,7 +90,7 @@ def test_slurm_where_there_is_none_and_wrong_settings_are_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert refusal() == "hydra/launcher=slurm: srun is missing here; submit from a machine of the cluster"
+    assert refusal() == "hydra/launcher=slurm: srun is not installed; submit from a node of the cluster"
     (tmp_path / "srun").write_text("#!/bin/sh")
     (tmp_path / "srun").chmod(0o755)
     assert refusal("hydra.launcher.partion=x").startswith(
@@ -115,7 +115,7 @@ def test_who_stops_waiting_for_jobs_is_told_that_they_go_on(
         submit([Job(tiny())], Launcher("slurm", {"max_num_timeout": 1}), lambda _: None)
     assert left.value.code == 130
     assert capsys.readouterr().err == (
-        "atlantis_exp: the jobs go on; python -m atlantis_exp sync publishes what they do\n"
+        "atlantis_exp: the jobs go on; python -m atlantis_exp sync publishes their runs\n"
     )
 
 

@@ -23,9 +23,9 @@ BASIC = Launcher()
 
 
 def in_turn(work: Callable[[T], object], jobs: Iterable[T]) -> None:
-    """Do jobs one after the other, also after an error; raise the first error at the end.
+    """Do jobs one after the other; go on after an error, and raise the first one at the end.
 
-    A signal that came too late to stop a job ends the process after it.
+    A signal that came too late to stop a job ends the process after that job.
     """
     first: Exception | None = None
     for job in jobs:

@@ -1,4 +1,4 @@
-"""Jobs side by side on this machine, each in a process of its own: if one ends, the others go on."""
+"""Run jobs side by side on this machine, each in its own process: if one fails, the others go on."""
 
 import os
 import signal
@@ -23,13 +23,13 @@ from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.launchers import BASIC, Launcher
 
-_ON_A_GPU = 4  # trainings that share one at no cost: docs/performance.md
+_ON_A_GPU = 4  # trainings that share one without loss: docs/performance.md
 _PROCESS_BYTES = 2**30  # of memory that a training takes besides its replay memory
-_COMPRESSED = 8  # times that observations shrink at least, the whole screen among them
+_COMPRESSED = 8  # least compression of observations, also of whole screens
 
 
 class _Running:
-    """The processes of the jobs under way."""
+    """The processes of running jobs."""
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         self.environment = environment
@@ -37,7 +37,7 @@ class _Running:
         self.processes: set[subprocess.Popen[str]] = set()
 
     def end(self, number: int, _: FrameType | None) -> NoReturn:
-        """Have the jobs commit and end on a signal; a second one ends this process at once."""
+        """Let the jobs commit and end on a signal; a second signal ends this process at once."""
         signal.signal(number, signal.SIG_DFL)
         self.has_ended = True
         terminal.warn(f"{signal.Signals(number).name}: the jobs commit and end")
@@ -47,9 +47,9 @@ class _Running:
 
 
 def fitting(jobs: Sequence[Job], planned: int) -> Launcher:
-    """Return the launcher that trains as many jobs at a time as this machine runs well; if that is one, the basic one.
+    """Return a launcher for as many jobs at a time as this machine runs well; the basic one for one job.
 
-    planned: the jobs of the whole sweep or look, some of which may have ended.
+    planned: number of jobs in the whole sweep or look, including ended ones.
     """
     configs = [job.config for job in jobs]
     on_gpu = any(choose_device(config.device).type != "cpu" for config in configs)
@@ -61,11 +61,11 @@ def fitting(jobs: Sequence[Job], planned: int) -> Launcher:
 def fitted(configs: Sequence[Config], planned: int, cores: int, own: int, memory: int, on_gpu: bool) -> tuple[int, int]:
     """Return how many trainings a machine runs well at a time, and the cores of each.
 
-    With one core each most seeds an hour are trained, unless a person says more by `threads`, `env.workers` or
-    OMP_NUM_THREADS. The cores are divided by the planned number of trainings, not by those that are left: one that
-    goes on has as many as before, on which its last bits depend.
+    One core each trains the most seeds per hour; `threads`, `env.workers` or OMP_NUM_THREADS may ask for more. All
+    planned trainings share the cores, not those left, so that a continued one keeps its number of cores, on which its
+    last bits depend.
 
-    own: cores, as OMP_NUM_THREADS says; as many as the machine has where it says nothing.
+    own: cores by OMP_NUM_THREADS, or all if it is not set.
     memory: available bytes.
     """
     asked = [config.threads or 1 for config in configs] + [config.env.workers or 1 for config in configs]
@@ -76,7 +76,7 @@ def fitted(configs: Sequence[Config], planned: int, cores: int, own: int, memory
 
 
 def _memory(config: Config) -> int:
-    """Return the bytes that a training takes at most, but for a network that is larger than ours."""
+    """Return the most bytes that a training takes with a network no larger than the built-in ones."""
     lengths = [phase.steps or config.replay.capacity for phase in config.phase.values()]
     observations = min(config.replay.capacity, sum(lengths), config.budget.steps or config.replay.capacity)
     return _PROCESS_BYTES + min(config.replay.max_bytes, observations * config.env.size**2 // _COMPRESSED)
@@ -85,13 +85,13 @@ def _memory(config: Config) -> int:
 def train_side_by_side(jobs: Sequence[Job], launcher: Launcher) -> None:
     """Train as many jobs at a time as the launcher says. Raises: the first job's Fault, once all have ended."""
     at_once, share = shared(all_cores(), launcher.settings["n_jobs"], jobs)
-    # A person's own number of threads goes before, but for one that would have each job take the whole machine.
+    # OMP_NUM_THREADS may lower a job's share, but not raise it to the whole machine.
     share = min(launcher.settings.get("cores", share), here().cores)
     threads = {"OMP_NUM_THREADS": f"{share}", "MKL_NUM_THREADS": f"{share}"}
     running = _Running({**os.environ, **threads, JOB_OF: "joblib"})
     handlers = {number: signal.signal(number, running.end) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        with ThreadPoolExecutor(at_once, "job") as pool:  # ends when its jobs have
+        with ThreadPoolExecutor(at_once, "job") as pool:  # waits for its jobs
             futures = [pool.submit(_train_apart, job, running) for job in jobs]
             wait(futures)
     finally:
@@ -104,7 +104,7 @@ def train_side_by_side(jobs: Sequence[Job], launcher: Launcher) -> None:
 def shared(cores: int, n_jobs: int, jobs: Sequence[Job]) -> tuple[int, int]:
     """Return how many jobs are trained at a time, and the cores of each.
 
-    n_jobs: at a time; below zero, that many fewer than one a core and one more, as joblib counts them.
+    n_jobs: at a time; -1 for one per core, -2 for one fewer, as in joblib.
     """
     left = sum(not has_ended(job.config) for job in jobs)
     at_once = max(min(n_jobs if n_jobs > 0 else cores + 1 + n_jobs, left), 1)
@@ -126,7 +126,7 @@ def _train_apart(job: Job, running: _Running) -> None:
             command, env=running.environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output, text=True
         )
         running.processes.add(process)
-        if running.has_ended:  # meanwhile
+        if running.has_ended:  # since the process started
             process.terminate()
         code = process.wait()
         running.processes.discard(process)
@@ -137,11 +137,11 @@ def _train_apart(job: Job, running: _Running) -> None:
     reason = (
         f"killed by {signal.Signals(-code).name}"
         if code < 0
-        else (said or ["it said nothing"])[-1].removeprefix("atlantis_exp: ")
+        else (said or ["it printed nothing"])[-1].removeprefix("atlantis_exp: ")
     )
     if code < 0 or code == 1:
         with suppress(Fault), folder.held():
             has_said_so = code == 1 and folder.state == "failed"
-            if not has_said_so and not has_ended(config):  # else it died after its run's end
+            if not has_said_so and not has_ended(config):  # else the process died after its run had ended
                 Journal(folder.path).status("KILLED" if code < 0 else "FAILED", reason)
     raise Fault(f"run {folder.name}: {reason}; see {folder.path / OUTPUT}", exit_code=code if code > 0 else 128 - code)
