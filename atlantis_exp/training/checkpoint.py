@@ -114,7 +114,7 @@ class Checkpoints:
         if memory is not None and (state := self._load(memory, True, [])) is not None:
             warn(f"no checkpoint has its whole replay memory: {self.lost:,} observations are lost, the run goes on")
             return state
-        raise CheckpointError(f"{faults[0]}, and no older one is whole; resume=never keeps this run and begins anew")
+        raise CheckpointError(f"{faults[0]}, and no older one is whole; resume=never keeps this run and starts over")
 
     def _load(self, memory: ReplayMemory | None, may_lose: bool, faults: list[str]) -> dict[str, Any] | None:
         """Return the newest state that can be read; append the faults of those that cannot."""
@@ -209,7 +209,7 @@ class Checkpoints:
     def _not_now(self, reason: str) -> CheckpointError:
         return CheckpointError(
             f"the checkpoints in {self.folder} cannot be read now ({reason}), but may be whole; the same command tries "
-            f"again, resume=never keeps this run and begins anew"
+            f"again, resume=never keeps this run and starts over"
         )
 
     def _clean(self, generation: int, segments: set[str]) -> None:
