@@ -424,7 +424,7 @@ def test_counters_that_no_training_comes_to_are_one_line(
     """Before anything is expected of them."""
     saved = {**dataclasses.asdict(Counters(steps=80, episodes=2)), **forged}
     monkeypatch.setattr(Checkpoints, "load", lambda *_: {"counters": saved})
-    with pytest.raises(CheckpointError, match=r"is not of this training \((ValueError|TypeError): "):
+    with pytest.raises(CheckpointError, match=r"does not fit this training \((ValueError|TypeError): "):
         train(Job(tiny(*SHORT, "budget.forecast=warn")))
 
 
