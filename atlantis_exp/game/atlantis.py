@@ -21,8 +21,8 @@ class Atlantis:
     episode_steps = 2_000  # in `Atlantis-v0`; a good player plays many times longer
     sources = ("centre_vessel", "side_vessel", "centre_bomber", "side_bomber", "wave_bonus")
     sources_in_words = (
-        "vessels and bombers, each hit by the centre gun or a side gun, and the bonus for standing buildings at the end "
-        "of a wave"
+        "vessels and bombers, each hit by the centre gun or a side gun, and the bonus for standing buildings at the "
+        "end of a wave"
     )
     random_score = 12_850.0
     human_score = 29_028.1

@@ -10,8 +10,8 @@ from torch.nn.functional import smooth_l1_loss
 from atlantis_exp.components import Quantiles, Rescaling
 
 QFunction: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
-"""Maps states (B, C, H, W) in [0, 1] to float32 values (B, A), or to N quantiles of each (B, A, N), without gradient, in
-the learner's choice of mode."""
+"""Maps states (B, C, H, W) in [0, 1] to float32 values (B, A), or to N quantiles of each (B, A, N), without gradient,
+in the learner's choice of mode."""
 
 
 class Objective(Protocol):

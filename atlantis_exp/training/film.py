@@ -43,7 +43,7 @@ def moments(episode: Episode, emulator: Emulator, start: int = 0) -> Iterator[Mo
 
 
 def span(episode: Episode, part: Part) -> tuple[int, int]:
-    """Return the first step of a part of an episode and the one after its last; a minute has the average number of steps."""
+    """Return the first step of a part of an episode and the one after its last, by average steps a minute."""
     minute = round(FRAMES_A_MINUTE * episode.steps / episode.frames)
     if part == "all" or minute >= episode.steps:
         return 0, episode.steps

@@ -166,7 +166,7 @@ class Recorder:
         step = counters.steps
         if (every := self.cadence.evaluate_steps) and not has_ended:
             # It belongs to the step at which it was due, as with the curves; the last one to the run's last step, where
-        # comparisons look for it.
+            # comparisons look for it.
             due = step - step % every
             step = due if step - due < num_envs else step
         episodes = self.cadence.final_episodes if has_ended else self.cadence.interim_episodes

@@ -280,7 +280,7 @@ def test_a_journal_with_a_damaged_line_is_refused_before_anything_is_trained_on_
     state = journaled(tmp_path, 1, 2)
     path = tmp_path / "journal.jsonl"
     path.write_bytes(bytes(20) + path.read_bytes()[20:])
-    with pytest.raises(ValueError, match=r"byte 0: not a record of a journal.*resume=never"):
+    with pytest.raises(ValueError, match=r"byte 0: not a journal record.*resume=never"):
         Journal(tmp_path).load_state_dict(state)
 
 
