@@ -66,7 +66,7 @@ def read_file(path: Path, most: int) -> bytes:
 
 
 def no_link(path: str, flags: int) -> int:
-    """Open a file, as `opener` of `open`: refuse symbolic links, cut hard links before writing, never wait for a pipe."""
+    """Open a file, as `opener` of `open`: refuse symbolic links, cut hard links before writing, wait for no pipe."""
     if flags & (os.O_WRONLY | os.O_RDWR):
         own(Path(path))
     return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
