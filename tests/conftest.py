@@ -287,7 +287,7 @@ def recorded(tiny: Callable[..., Config]) -> Callable[..., Path]:
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    """Return a function that runs a command line here and returns its exit code: `command("evaluate", "run=latest")`."""
+    """Return a function that runs a command line and returns its exit code: `command("evaluate", "run=latest")`."""
 
     def run(*words: str) -> int:
         monkeypatch.setattr(sys, "argv", ["atlantis_exp", *words])
