@@ -365,7 +365,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for drawn in [draw(np.random.default_rng(2), (count, 2, SEEDS))]
     }
     print_table(
-        "two equal groups of which something is decided, where the scores say when to ask, in %",
+        "two equal groups that are decided if the scores say when to ask, in %",
         ("", "watching"),
         [(shape, percent(share)) for shape, share in watched.items()],
     )

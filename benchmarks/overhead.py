@@ -124,7 +124,7 @@ def evaluation_seconds(trainer: Trainer) -> float:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table and the JSON line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.overhead", description="what tracking costs")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.overhead", description="the cost of tracking")
     parser.add_argument("--rounds", type=int, default=5, help="turns of each training")
     parser.add_argument("--seconds", type=float, default=30.0, help="length of a turn")
     parser.add_argument("--commit-seconds", type=float, default=10.0, help="time between two commits")

@@ -23,7 +23,7 @@ from atlantis_exp.statistics import interquartile_mean
 DATA = Path("docs/data/ladder.csv")
 COLUMNS = ("run", "command", "commit", "updates", "hours", "steps", "training", "evaluation")
 EVERY = 5_000  # steps between two points of a curve
-# What is said once, above the table.
+# Options that the text above the table gives once.
 COMMON = ("seed=", "threads=", "env.workers=", "phase=brief", "evaluation.")
 
 
