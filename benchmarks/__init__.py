@@ -1,1 +1,1 @@
-"""Throughput and memory, each module a command that prints a table and, as its last line, one JSON object."""
+"""Measure throughput and memory; each module is a command that prints a table and, as its last line, a JSON object."""

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.commit`: what a commit costs with a full memory of a million observations, and loading it."""
+"""Time commits with a full memory of a million observations, and loading one: `python -m benchmarks.commit`."""
 
 import json
 import shutil
@@ -20,7 +20,7 @@ from atlantis_exp.training.checkpoint import Checkpoints
 CAPACITY = 1_000_000  # observations
 SIZE = 159  # pixels
 EVERY_SECONDS = 120.0
-EVERY_STEPS = 20_000  # that a fast training takes in that time
+EVERY_STEPS = 20_000  # of a fast training in that time
 COMMITS = 8
 BUDGET = 2**30  # bytes
 

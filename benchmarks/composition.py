@@ -1,10 +1,10 @@
-"""Configs for the benchmarks; apart from `contest`, since most contestants start faster without Hydra."""
+"""Compose configs for the benchmarks; apart from `contest`, since most contestants start faster without Hydra."""
 
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.config import Config
 
 
 def composed(*overrides: str) -> Config:
-    """The config of a training, as the command line composes it. Raises: ConfigError."""
+    """Return a training's config as the command line composes it. Raises: ConfigError."""
     (config,) = check("config", Config, overrides).values()
     return config

@@ -1,4 +1,4 @@
-"""What the benchmarks share: contestants that work in turns, and tables."""
+"""Let contestants work in turns, and print tables."""
 
 import json
 import multiprocessing
@@ -20,13 +20,13 @@ Measure = Callable[[float], T]  # of seconds to work for
 
 
 class Contestant(Generic[T]):
-    """A program in a process of its own that works only while it is measured.
+    """A program in its own process that works only while it is measured.
 
-    `program`, a picklable call, builds it there, warms it up and hands over what measures it.
+    There `program`, a picklable callable, builds it, warms it up and yields the function that measures it.
     """
 
     def __init__(self, program: Callable[[], AbstractContextManager[Measure[T]]]) -> None:
-        context = multiprocessing.get_context("spawn")  # a clean process: no memory and no threads of this one
+        context = multiprocessing.get_context("spawn")  # a clean process, without this one's memory and threads
         self._connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(program, theirs))
         self._process.start()
@@ -35,16 +35,16 @@ class Contestant(Generic[T]):
             self._connection.recv()
 
     def begin(self, seconds: float) -> None:
-        """Let it work; `finish` has the result."""
+        """Start the work; `finish` returns the result."""
         self._connection.send(seconds)
 
     def finish(self) -> T:
-        """Wait for what it measured; EOFError if it died, its traceback is on stderr."""
+        """Wait for the measurement and return it. Raises: EOFError if the process died; stderr has its traceback."""
         measured: T = self._connection.recv()
         return measured
 
     def measure(self, seconds: float) -> T:
-        """What it measures over some seconds."""
+        """Return the measurement over some seconds."""
         self.begin(seconds)
         return self.finish()
 
@@ -67,7 +67,7 @@ def _serve(program: Callable[[], AbstractContextManager[Measure[Any]]], connecti
 
 
 def take_turns(turns: Mapping[str, Callable[[], T]], rounds: int) -> dict[str, list[T]]:
-    """What each call returns, A B C A B C ..., so that a change of the machine's other load meets all alike."""
+    """Call all in turn, A B C A B C ..., so that other load affects all alike; return the results of each."""
     results: dict[str, list[T]] = {name: [] for name in turns}
     total, began = rounds * len(turns), time.monotonic()
 
@@ -84,7 +84,7 @@ def take_turns(turns: Mapping[str, Callable[[], T]], rounds: int) -> dict[str, l
 
 
 def calls_per_second(call: Callable[[], object], seconds: float) -> float:
-    """How often a call can be made, one after the other."""
+    """Return the rate of successive calls."""
     began, calls, elapsed = time.perf_counter(), 0, 0.0
     while elapsed < seconds:
         call()
@@ -94,25 +94,25 @@ def calls_per_second(call: Callable[[], object], seconds: float) -> float:
 
 
 def ratio(rates: Sequence[float] | None, others: Sequence[float] | None) -> float | None:
-    """The ratio of the medians, None where one side was not measured."""
+    """Return the ratio of the medians, or None if one side was not measured."""
     return statistics.median(rates) / statistics.median(others) if rates and others else None
 
 
 def paired_ratio(rates: Sequence[float] | None, others: Sequence[float] | None) -> float | None:
-    """The median of the rounds' ratios, None where one side was not measured."""
+    """Return the median of the rounds' ratios, or None if one side was not measured."""
     return statistics.median(a / b for a, b in zip(rates, others, strict=True)) if rates and others else None
 
 
 def medians(rates: Mapping[str, Sequence[float]]) -> dict[str, float]:
-    """The median rate of each contestant."""
+    """Return the median rate of each contestant."""
     return {name: statistics.median(values) for name, values in rates.items()}
 
 
 def missing(peer: str) -> bool:
-    """Whether a peer's package is not installed; says so."""
+    """Return whether a peer's package is missing, and say so."""
     if find_spec(peer) is not None:
         return False
-    print(f"{peer} is not installed, so it is left out: pip install 'atlantis-exp[peers]'")
+    print(f"leaving out {peer}, which is not installed: pip install 'atlantis-exp[peers]'")
     return True
 
 
@@ -136,5 +136,5 @@ def print_rates(title: str, unit: str, rates: Mapping[str, Sequence[float]]) -> 
 
 
 def print_results(results: Mapping[str, Any]) -> None:
-    """Print the figures as one line of JSON."""
+    """Print the figures as a line of JSON."""
     print(json.dumps(results), flush=True)

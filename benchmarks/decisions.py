@@ -1,10 +1,10 @@
-"""How often a verdict is wrong for whoever follows it to the end: `python -m benchmarks.decisions`.
+"""Measure how often verdicts are wrong: `python -m benchmarks.decisions`.
 
-Groups of ten seeds are drawn whose true means are known, and users compare them through `comparison.decision`: one
-who trains up to the next look that is printed, one who asks after every seed, and one who asks after every seed and has
-a look taken each time. All of them continue until nothing is open. The plan promises nothing to a fourth, who watches
-the scores and asks once they are far enough apart. A decision is false where it says better or worse
-of two groups of one mean, or equivalent of two that are delta apart. Values are in standard deviations of one group.
+Users compare groups of ten seeds with known true means through `comparison.decision`. One trains up to the next printed
+look, one asks after every seed, and one takes a look after every seed. All continue until nothing is open. The plan
+promises nothing to a fourth, who watches the scores and asks once they are far enough apart. A decision is false if it
+calls one of two groups with equal means better or worse, or two groups that differ by delta equivalent. Values are in
+standard deviations of one group.
 """
 
 import argparse
@@ -34,11 +34,11 @@ GROUPS = (2, 4, 8)
 NOISE = 0.1  # within a mode, in distances between the two
 RESAMPLES = 999
 KEPT = Path(__file__).resolve().parents[1] / "results" / "verdict" / "runs"
-NETWORKS = ("cnn", "resnet_fast")  # of which ten seeds are kept
+NETWORKS = ("cnn", "resnet_fast")  # with ten kept seeds each
 
 
 def normal(rng: np.random.Generator, shape: tuple[int, ...]) -> Values:
-    """Mean 0, standard deviation 1, as all that follow."""
+    """Draw with mean 0 and standard deviation 1, as do all below."""
     return rng.normal(size=shape)
 
 
@@ -47,7 +47,7 @@ def lognormal(rng: np.random.Generator, shape: tuple[int, ...]) -> Values:
 
 
 def bimodal(rng: np.random.Generator, shape: tuple[int, ...], survival: float = 0.7) -> Values:
-    """Seeds that survive with this probability and else collapse, as in Atlantis."""
+    """Draw seeds that survive with this probability and else collapse, as in Atlantis."""
     values = (rng.random(shape) < survival) + NOISE * rng.normal(size=shape)
     return np.asarray((values - survival) / np.sqrt(survival * (1 - survival) + NOISE**2))
 
@@ -57,12 +57,12 @@ def halves(rng: np.random.Generator, shape: tuple[int, ...]) -> Values:
 
 
 def steady(rng: np.random.Generator, shape: tuple[int, ...]) -> Values:
-    """Seeds that vary by a tenth of the others."""
+    """Draw seeds with a tenth of the others' spread."""
     return 0.1 * rng.normal(size=shape)
 
 
 def at_the_cap(rng: np.random.Generator, shape: tuple[int, ...]) -> Values:
-    """Nine seeds of ten at the cap to the point, the others low; the mean is 0."""
+    """Draw nine of ten seeds exactly at the cap, the others low, with mean 0."""
     return np.asarray(np.where(rng.random(shape) < 0.9, 1.0, 0.3 * rng.random(shape)) - 0.915) / 0.265
 
 
@@ -74,7 +74,7 @@ SHAPES = {"normal": normal, "log-normal": lognormal, "bimodal 70:30": bimodal, "
 
 
 def advised(values: Values, plan: Plan) -> tuple[Decision, int]:
-    """Train contenders up to the look that is due next; the decision, and the number of seeds of group 0."""
+    """Train contenders up to the next due look; return the decision and the number of seeds of group 0."""
     return _follow(values, plan, lambda _, due: due, now=False)
 
 
@@ -84,12 +84,12 @@ def one_by_one(values: Values, plan: Plan) -> tuple[Decision, int]:
 
 
 def every_seed(values: Values, plan: Plan) -> tuple[Decision, int]:
-    """Ask after every seed, and have a look taken whether it is due or not."""
+    """Take a look after every seed, whether due or not."""
     return _follow(values, plan, lambda trained, _: trained + 1, now=True)
 
 
 def watching(values: Values, plan: Plan) -> tuple[Decision, int]:
-    """Look at the scores after every seed, and ask for the first time once they are far enough apart to be decided."""
+    """Watch the scores after every seed, and first ask once they are far enough apart to be decided."""
     for trained in range(plan.looks[0], plan.looks[-1] + 1):
         seeds = {f"group {index}": dict(enumerate(row[:trained])) for index, row in enumerate(values.tolist())}
         decision = decide(seeds, plan, now=True)
@@ -116,12 +116,12 @@ USERS: Mapping[str, Follow] = {"advised": advised, "one by one": one_by_one, "lo
 
 
 def false_decision(values: Values, plan: Plan, follow: Follow) -> bool:
-    """Whether anything is decided of groups of one mean."""
+    """Return whether any of several groups with equal means are decided."""
     return any(verdict.said in ("better", "worse") for verdict in follow(values, plan)[0].verdicts)
 
 
 def false_of_two_means(values: Values, plan: Plan) -> bool:
-    """Whether a verdict is wrong where groups 1, 3 and 5 are delta better than groups 0, 2 and 4."""
+    """Return whether a verdict is wrong if groups 1, 3 and 5 are delta better than groups 0, 2 and 4."""
     for verdict in advised(values, plan)[0].verdicts:
         above = int(verdict.group.split()[1]) % 2 - int(verdict.other.split()[1]) % 2
         wrong = {0: ("better", "worse"), 1: ("worse", "equivalent"), -1: ("better", "equivalent")}
@@ -131,17 +131,17 @@ def false_of_two_means(values: Values, plan: Plan) -> bool:
 
 
 def found(values: Values, plan: Plan) -> tuple[float, float]:
-    """The share of the pairs with group 0 in which it is found better, and the seeds it takes until all of them are."""
+    """Return the share of the pairs with group 0 that find it better, and the seeds until all of them do."""
     decision, seeds = advised(values, plan)
     pairs = [verdict.said == "better" for verdict in decision.verdicts if verdict.group == "group 0"]
     return float(np.mean(pairs)), seeds
 
 
 def before(values: Values, every: bool) -> tuple[bool, int]:
-    """Whether two groups were found to differ before there was a plan, and after how many seeds.
+    """Return whether two groups differ by the rule before plans, and after how many seeds.
 
-    From three seeds on Welch's 95 % interval was tested, after every seed or after "about K more seeds", the number at
-    which the interval would leave out zero if means and variances stayed as they were.
+    From three seeds on it tested Welch's 95 % interval, after every seed or after "about K more seeds", the number at
+    which the interval would exclude zero if means and variances did not change.
     """
     trained = 3
     while True:
@@ -156,12 +156,12 @@ def before(values: Values, every: bool) -> tuple[bool, int]:
 
 
 def at_once(values: Values) -> tuple[bool, int]:
-    """Whether one look at ten seeds finds that two groups differ."""
+    """Return whether one look at ten seeds finds that two groups differ."""
     return false_decision(values, Plan(looks=(SEEDS,)), advised), SEEDS
 
 
 def by_plan(values: Values) -> tuple[bool, int]:
-    """Whether looks at five and ten seeds find that two groups differ, and the seeds that it takes."""
+    """Return whether looks at five and ten seeds find that two groups differ, and the seeds used."""
     decision, seeds = advised(values, Plan())
     return decision.verdicts[0].said != "not decided", seeds
 
@@ -175,7 +175,7 @@ PROCEDURES: Mapping[str, Callable[[Values], tuple[bool, int]]] = {
 
 
 def covered(values: Values, means: Values, plan: Plan) -> tuple[float, float]:
-    """The share of intervals that hold the true difference, and 1 where all of them do."""
+    """Return the share of intervals that contain the true difference, and 1 if all do."""
     holds = [
         verdict.low <= means[int(verdict.group.split()[1])] - means[int(verdict.other.split()[1])] <= verdict.high
         for verdict in advised(values, plan)[0].verdicts
@@ -184,10 +184,10 @@ def covered(values: Values, means: Values, plan: Plan) -> tuple[float, float]:
 
 
 def coverage_of_means(values: Values, rng: np.random.Generator) -> dict[str, float]:
-    """How often 95 % intervals of the mean over seeds hold 0, over rows of values, by method.
+    """Return the share of rows whose 95 % interval of the mean over seeds contains 0, by method.
 
-    Student's t is what `decision.mean_interval` gives. The others are bootstraps over seeds (Efron and Tibshirani
-    1993): percentiles, bias-corrected and accelerated, and studentized.
+    Student's t is `decision.mean_interval`. The others are bootstraps over seeds (Efron and Tibshirani 1993):
+    percentiles, bias-corrected and accelerated, and studentized.
     """
     rows, size = values.shape
     means, errors = values.mean(axis=1), values.std(axis=1, ddof=1) / np.sqrt(size)
@@ -215,19 +215,19 @@ def coverage_of_means(values: Values, rng: np.random.Generator) -> dict[str, flo
 
 
 class Outputs:
-    """Comparisons of the same runs, as an outputs folder keeps them; `false` and `silent` say what they came to.
+    """Comparisons of the same runs, as in an outputs folder, with their errors in `false` and `silent`.
 
     Args:
-        values: a row of seeds for each group; all groups have one mean.
+        values: a row of seeds for each group; all groups have equal means.
     """
 
     def __init__(self, values: Values) -> None:
         self.values, self.kept = values.tolist(), dict[str, Asked]()
         self.false = False  # any verdict
-        self.silent = False  # any false verdict next to which nothing is said of other questions or of missing seeds
+        self.silent = False  # any false verdict without a line about other questions or missing seeds
 
     def ask(self, name: str, seeds: Mapping[int, Sequence[int]], upto: int = SEEDS, now: bool = False) -> Decision:
-        """Ask of some seeds of some groups, in a plan of `upto` seeds; the same name is the same question again."""
+        """Compare some seeds of some groups in a plan of `upto` seeds; the same name repeats the same question."""
         groups = [
             Group((str(group),), {seed: self.values[group][seed] for seed in chosen}) for group, chosen in seeds.items()
         ]
@@ -247,7 +247,7 @@ class Outputs:
 
 
 def longer_plans(outputs: Outputs, plans: Sequence[int] = (10, 20, 40)) -> None:
-    """Prolong the plan until something is decided."""
+    """Extend the plan until something is decided."""
     for upto in plans:
         for size in looks_up_to(upto):
             outputs.ask(f"{upto}", {0: range(size), 1: range(size)}, upto)
@@ -258,14 +258,14 @@ def every_plan(outputs: Outputs) -> None:
 
 
 def each_pair(outputs: Outputs) -> None:
-    """Ask of all groups, then of each pair."""
+    """Compare all groups, then each pair."""
     for groups in (range(len(outputs.values)), *combinations(range(len(outputs.values)), 2)):
         for size in (5, 10):
             outputs.ask(f"{groups}", {group: range(size) for group in groups})
 
 
 def best_and_worst(outputs: Outputs) -> None:
-    """Ask of all groups, then of the best and the worst."""
+    """Compare all groups, then the best and the worst."""
     for size in (5, 10):
         outputs.ask("all", {group: range(size) for group in range(len(outputs.values))})
     means = [float(np.mean(row[:10])) for row in outputs.values]
@@ -274,20 +274,20 @@ def best_and_worst(outputs: Outputs) -> None:
 
 
 def leave_one_out(outputs: Outputs) -> None:
-    """Ask with ten seeds, then without each of them."""
+    """Compare ten seeds, then leave out each of them."""
     for left_out in (None, *range(10)):
         seeds = [seed for seed in range(10) if seed != left_out]
         outputs.ask(f"without {left_out}", {0: seeds, 1: seeds}, now=True)
 
 
 def one_more_group(outputs: Outputs) -> None:
-    """Ask of two groups, then of three, and so on."""
+    """Compare two groups, then three, and so on."""
     for count, size in product(range(2, len(outputs.values) + 1), (5, 10)):
         outputs.ask(f"{count}", {group: range(size) for group in range(count)})
 
 
 def lowest_deleted(outputs: Outputs) -> None:
-    """Delete the lowest seed of the group that leads, and only then ask."""
+    """Delete the leading group's lowest seed, and only then compare."""
     rows = [row[:10] for row in outputs.values]
     leader = int(np.mean(rows, axis=1).argmax())
     lowest = rows[leader].index(min(rows[leader]))
@@ -309,7 +309,7 @@ SCORES = ("last evaluation", "training")
 
 
 def kept_seeds(score: str) -> dict[str, Values]:
-    """Return the scores of ten kept seeds of each network: of 100 games of the last weights, or while training."""
+    """Return the scores of ten kept seeds of each network: of 100 games with the last weights, or while training."""
     scores: dict[str, list[float]] = {network: [] for network in NETWORKS}
     for folder in sorted(KEPT.glob("*-uniform-s*")):
         config, result = (json.loads((folder / f"{name}.json").read_text()) for name in ("config", "result"))
@@ -324,7 +324,7 @@ def kept_seeds(score: str) -> dict[str, Values]:
 
 
 def percent(share: float) -> str:
-    """A share in percent, as the tables print it."""
+    """Format a share in percent for the tables."""
     return f"{100 * share:.1f}"
 
 
@@ -342,7 +342,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             follow(values, plan)
     minutes = (time.perf_counter() - began) / 10 * count * 5 / 60  # the work of five shapes, roughly
     margin = 196 * np.sqrt(0.05 * 0.95 / count)
-    print(f"{count:,} comparisons in a cell, so 5 % are known to {margin:.1f}; about {minutes:.1f} minutes", flush=True)
+    print(f"{count:,} comparisons a cell estimate 5 % to {margin:.1f}; about {minutes:.1f} minutes", flush=True)
 
     wrong = {
         f"{shape}, {groups} groups": {
@@ -365,7 +365,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for drawn in [draw(np.random.default_rng(2), (count, 2, SEEDS))]
     }
     print_table(
-        "two equal groups of which something is decided, where the scores say when to ask, in %",
+        "two equal groups that are decided if the scores say when to ask, in %",
         ("", "watching"),
         [(shape, percent(share)) for shape, share in watched.items()],
     )
@@ -380,8 +380,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "silent": float(np.mean([outputs.silent for outputs in folders])),
         }
     print_table(
-        "equal groups (normal) asked in several ways: any false verdict, and any without a word of it, in %",
-        ("", "false", "without a word"),
+        "equal groups (normal) compared in several ways: any false verdict, and any without such a line, in %",
+        ("", "false", "without a line"),
         [(asker, percent(row["false"]), percent(row["silent"])) for asker, row in askers.items()],
     )
 

@@ -1,11 +1,10 @@
-"""Emulation speed against the peers and against bare emulators: `python -m benchmarks.emulation`.
+"""Compare emulation speed with the peers and with bare emulators: `python -m benchmarks.emulation`.
 
-All play Atlantis with random actions at skip 4 and sticky 0.25, `--num-envs` environments in lock-step, and hand over
-84x84 grey observations; no stack, which is not the emulators' work here. The `vs_` figures are of the report's
-preprocessing, a crop of the last frame, which no peer can make; those of the `_whole_screen` are of the peers' own, the
-whole screen, each pixel the brighter of a step's last two frames. The peers have as many threads as there are cores, or
-twice as many: the better one counts. Bare emulators, one process a core, emulate frames and look at none. Each
-contestant is a process of its own and rests while the others have their turns.
+All play Atlantis with random actions at skip 4 and sticky 0.25, `--num-envs` environments in lock-step, and return
+84x84 grey observations without a stack. `vs_` figures are for the report's preprocessing, a crop of the last frame,
+which no peer supports; `_whole_screen` figures are for the peers' own, the whole screen with each pixel's maximum over
+a step's last two frames. The peers have one thread a core, or two: the better one counts. Bare emulators, one process a
+core, emulate frames without reading them. Each contestant has its own process and rests during the others' turns.
 """
 
 import argparse
@@ -41,7 +40,7 @@ _CORES = len(os.sched_getaffinity(0))
 
 @contextmanager
 def ours(num_envs: int, make: Callable[[], Emulator]) -> Iterator[Measure[float]]:
-    """Our emulators, in processes where there are several."""
+    """Our emulators, several of them in worker processes."""
     rng = np.random.default_rng(0)
     with make_emulators(make, num_envs, _CORES) as emulators:
         emulators.reset(range(num_envs), list(range(num_envs)))
@@ -87,7 +86,7 @@ def envpool(num_envs: int, threads: int) -> Iterator[Measure[float]]:
         num_threads=threads,
         repeat_action_probability=0.25,
         stack_num=1,
-        noop_max=1,  # its least
+        noop_max=1,  # its minimum
         use_fire_reset=False,
     )
     yield _play(env, num_envs, np.int32)
@@ -96,7 +95,7 @@ def envpool(num_envs: int, threads: int) -> Iterator[Measure[float]]:
 
 @contextmanager
 def bare() -> Iterator[Measure[float]]:
-    """One emulator that nobody looks at."""
+    """An emulator whose screens nobody reads."""
     ale = ALEInterface()
     ale.setFloat("repeat_action_probability", 0.25)
     ale.loadROM(get_rom_path("atlantis"))  # type: ignore[arg-type]
@@ -121,7 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seconds", type=float, default=5.0, help="length of a turn")
     args = parser.parse_args(arguments)
 
-    # Here, as no contestant needs torch.
+    # Here, since no contestant needs torch.
     from atlantis_exp.build import make_emulator
     from benchmarks.composition import composed
 

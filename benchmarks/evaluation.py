@@ -1,10 +1,9 @@
-"""How near evaluation is to what it is made of, and what a film costs: `python -m benchmarks.evaluation`.
+"""Compare evaluation with its parts, and time a film: `python -m benchmarks.evaluation`.
 
-A shipped network plays many games at once, as `evaluate weights=...` does. Its steps a second are set against those
-of emulators alone, in a process a core that waits for nobody, and against the states a second of the network's pass
-over such a batch alone: `of_limit` is the time that emulation and pass of a step take one after the other, as a share
-of what the step took. The parts take turns in processes of their own. `film_seconds` is the processor time of a film
-of a whole game, from its seed, actions and values.
+A shipped network plays many games at once, as with `evaluate weights=...`. Its steps a second are compared with those
+of bare emulators, an independent process a core, and with the states a second of the network's pass over such a batch.
+`of_limit` is the time of a step's emulation plus pass, as a share of the step's actual time. The parts take turns in
+their own processes. `film_seconds` is the processor time of a film of a whole game from its seed, actions and values.
 """
 
 import argparse
@@ -41,7 +40,7 @@ _QUIET = Progress(Console(quiet=True))
 
 
 def player(folder: str, num_envs: int, max_steps: int | None = None) -> tuple[Actor, Evaluator]:
-    """A shipped network and its card's protocol, with so many games at once."""
+    """Return a shipped network and its card's protocol, with a number of games at once."""
     card, weights = read_card(Path(folder))
     env = card.config.env if max_steps is None else replace(card.config.env, max_steps=max_steps)
     evaluation = replace(card.evaluation, num_envs=num_envs, video="all")
@@ -50,7 +49,7 @@ def player(folder: str, num_envs: int, max_steps: int | None = None) -> tuple[Ac
 
 @contextmanager
 def evaluating(folder: str, num_envs: int) -> Iterator[Measure[float]]:
-    """Games as `evaluate` plays them, begun anew in each turn."""
+    """Games as `evaluate` plays them, restarted in each turn."""
     actor, evaluator = player(folder, num_envs)
 
     def measure(seconds: float) -> float:
@@ -70,7 +69,7 @@ def evaluating(folder: str, num_envs: int) -> Iterator[Measure[float]]:
 
 @contextmanager
 def emulating(folder: str, num_envs: int) -> Iterator[Measure[float]]:
-    """The share of the games of one core, in this process, by chance."""
+    """One core's share of the games, in this process, with random actions."""
     cv2.setNumThreads(1)
     card, _ = read_card(Path(folder))
     emulators, rng = SerialEmulators(make_emulator(card.config.env), num_envs), np.random.default_rng(0)
@@ -95,14 +94,14 @@ def passing(folder: str, num_envs: int) -> Iterator[Measure[float]]:
 
 
 def _together(contestants: Sequence[Contestant[float]], seconds: float) -> float:
-    """The rates of contestants that work at once, added up."""
+    """Let contestants work at the same time; return the sum of their rates."""
     for contestant in contestants:
         contestant.begin(seconds)
     return sum(contestant.finish() for contestant in contestants)
 
 
 def film_seconds(folder: str, steps: int) -> tuple[float, int]:
-    """The processor time of a film of one game, whose playing does not count, and its bytes."""
+    """Return the processor time of a film of one game, without playing it, and the film's bytes."""
     actor, evaluator = player(folder, 1, steps)
     (episode,) = evaluator(actor, 1, _QUIET).episodes
     before = os.times()

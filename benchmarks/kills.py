@@ -1,13 +1,12 @@
-"""Trainings that are killed again and again, against unbroken ones: `python -m benchmarks.kills --kills 1000`.
+"""Compare trainings killed again and again with unbroken ones: `python -m benchmarks.kills --kills 1000`.
 
-Each of the trainings below is made once unbroken. Then its copies are killed by SIGKILL at random moments right behind
-a commit, mostly within the next ones, until there have been as many kills as were asked for, and every copy is
-continued to its end. A copy must have the fingerprint of the unbroken one: weights, replay memory, random streams,
-emulators, and all that its journal holds.
+Each training below first runs unbroken. Then copies get SIGKILLs at random moments shortly after a commit, often during
+the next ones, and continue to their end, until all kills have struck. A copy must have the fingerprint of the unbroken
+training: weights, replay memory, random streams, emulators, and the contents of its journal.
 
-A session is a process of its own with nothing but what the disk holds. Those of one training are forked from a server
-that has only imported the package, since to import it takes longer than all else. The last of the trainings is a sweep
-of two seeds on joblib, which is started as a person would, and killed with all its processes.
+A session is a new process that knows only the disk. A training's sessions are forks of a server that has imported the
+package, since the import takes longer than all else. The last training is a joblib sweep of two seeds, which is started
+as by a person, and killed with all its processes.
 """
 
 import argparse
@@ -55,12 +54,12 @@ TRAININGS = {
 SWEEP = "sweep"
 _KILLS_OF_ONE = {SWEEP: 5}  # copies of the others are killed until they end
 _SECONDS = 0.3  # after a commit; there is one every 0.1 s
-_EARLY_SECONDS = 10.0  # in which a session starts
+_EARLY_SECONDS = 10.0  # of a session's start
 _FORKS = multiprocessing.get_context("forkserver")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Kill, compare, print."""
+    """Kill, compare and print."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.kills")
     parser.add_argument("--kills", type=int, default=1_000)
     parser.add_argument("--only", choices=[*TRAININGS, SWEEP], action="append", help="sweep is one on joblib")
@@ -101,7 +100,7 @@ def _so_far(outputs: Path) -> str:
 
 
 def _killed(name: str, outputs: Path, kills: int, early: float) -> tuple[int, dict[str, str]]:
-    """Train one of them to its end, with kills on the way; how many struck, and its fingerprints."""
+    """Train one of them to its end, with kills on the way; return how many struck, and its fingerprints."""
     place = f"paths.outputs={outputs}"
     if name == SWEEP:
         launcher = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
@@ -123,14 +122,14 @@ def train_and_kill(config: Config, overrides: Sequence[str], outputs: Path, kill
     Raises:
         Fault: a session ended with an error.
     """
-    # The moments of commits change nothing, and a run continues from one.
+    # The time of a commit changes nothing, and a run continues from one.
     own = (f"paths.outputs={outputs}", "tracking.commit_seconds=1.0", "resume=auto")
     command = (sys.executable, "-m", "atlantis_exp", "train", *replaced(overrides, *own))
     return run_and_kill(lambda said: start(command, said), outputs, config.run_name(), kills)
 
 
 class Session(Protocol):
-    """A process that trains; `poll` and `wait` as of Popen."""
+    """A process that trains; `poll` and `wait` work as in Popen."""
 
     pid: int
 
@@ -140,7 +139,7 @@ class Session(Protocol):
 
 
 def start(command: Sequence[str], said: Path) -> Session:
-    """Start a command in a process group of its own; stderr goes to the file `said`, stdout to one next to it."""
+    """Start a command in its own process group; stderr goes to the file `said`, stdout to one next to it."""
     with open(said, "wb") as errors, open(said.with_name("stdout.txt"), "wb") as lines:
         return subprocess.Popen(command, stdout=lines, stderr=errors, start_new_session=True)
 
@@ -151,7 +150,7 @@ def run_and_kill(
 ) -> int:
     """Start sessions that write runs under `outputs` until one ends by itself; return how many kills struck.
 
-    Up to `kills` times, a session's process group gets a SIGKILL at a random moment within some seconds of a commit.
+    Up to `kills` times, send a session's process group a SIGKILL at a random moment within some seconds of a commit.
 
     Args:
         start: starts a session, the leader of a process group, whose stderr goes to the given file.
@@ -180,14 +179,14 @@ def run_and_kill(
                     error = _last_line(outputs / "stderr.txt")
                     raise Fault(f"a session under {outputs} failed: {error or 'it said nothing'}")
                 return struck
-        finally:  # a signal that ends this process does not reach the session, in a group of its own
+        finally:  # a signal that ends this process does not reach the session, in its own group
             with suppress(ProcessLookupError):  # it has just ended
                 os.killpg(session.pid, signal.SIGKILL)
         struck += session.wait() == -signal.SIGKILL
 
 
 def _last_line(path: Path) -> str:
-    """Return the last line of a file, empty if there is none."""
+    """Return the last line of a file; empty without one."""
     lines = path.read_text(errors="replace").split("\n") if path.exists() else []
     return next((line.strip() for line in reversed(lines) if line.strip()), "")
 
@@ -221,7 +220,7 @@ class _Fork(Session):
 
 
 def _train(words: Sequence[str], said: Path, ready: "multiprocessing.connection.Connection[None, None]") -> None:
-    """What the command line does with these words."""
+    """Train as the command line would with these words."""
     os.setsid()
     ready.send(None)
     for number, file in ((1, Path(os.devnull)), (2, said)):

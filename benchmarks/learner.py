@@ -1,11 +1,11 @@
-"""The learner's arithmetic against the machine's own: `python -m benchmarks.learner`.
+"""Compare the learner's FLOP rate with the machine's: `python -m benchmarks.learner`.
 
-What an update computes is counted by torch's flop counter: convolutions and matrix products of the online network's
-forward and backward pass and of the target network's forward pass, no gradient with regard to the states. What it takes
-is all of `Learner.update`: uint8 in, loss, optimizer and soft update included. Each turn is compared with a
-multiplication of square matrices in the same number format, right before it in the same process.
+Torch's counter gives an update's FLOPs: convolutions and matrix products of the online network's forward and backward
+pass and of the target network's forward pass, without the gradient of the states. The time is that of
+`Learner.update`, from uint8 to loss, optimizer and soft update. Each turn is compared with a multiplication of square
+matrices in the same format, right before it in the same process.
 
-`--against OVERRIDE...` measures the same updates under these overrides, too: `compile=true`, `training.ema=2000`.
+`--against OVERRIDE...` also measures the same updates with these overrides: `compile=true`, `training.ema=2000`.
 """
 
 import argparse
@@ -28,7 +28,7 @@ _SIDE = 2_048  # of the square matrices; larger ones were no faster
 
 
 class Case(NamedTuple):
-    """A network with its batch, in a number format."""
+    """A network with its batch and number format."""
 
     model: str
     batch_size: int  # transitions
@@ -47,11 +47,11 @@ CASES = tuple(Case(*network, precision) for network in (("cnn", 128), ("resnet",
 
 
 def update_of(config: Config) -> Callable[[], object]:
-    """An update of a learner on a batch of noise; sets torch's threads to what the learner has in a training."""
+    """Return an update of a learner on a batch of noise; set torch's threads as in a training."""
     set_up_torch(config, config.device)
     learner, batch_size = build_learner(config), config.training.batch_size
     rng = np.random.default_rng(0)
-    # As the replay memory hands them over: frame by frame, seen as state by state.
+    # In the replay memory's layout: frame by frame, viewed as state by state.
     frames = rng.integers(0, 256, (config.env.stack + 1, batch_size, config.env.size, config.env.size), np.uint8)
     states = frames.swapaxes(0, 1)
     batch = (
@@ -65,13 +65,13 @@ def update_of(config: Config) -> Callable[[], object]:
 
 
 def flops_of(config: Config) -> int:
-    """The floating-point operations of an update of a learner."""
+    """Return the floating-point operations of a learner's update."""
     env = config.env
     return build_learner(config).update_flops((env.stack, env.size, env.size), config.training.batch_size)
 
 
 def gemm_of(precision: str) -> Callable[[], None]:
-    """A multiplication of two square matrices."""
+    """Return a multiplication of two square matrices."""
     device = choose_device("auto")
     dtype = torch.bfloat16 if precision == "bf16" else torch.float32
     a, b = torch.ones(2, _SIDE, _SIDE, device=device, dtype=dtype)
@@ -86,7 +86,7 @@ def gemm_of(precision: str) -> Callable[[], None]:
 
 
 def chosen(names: Sequence[str] | None) -> list[Case]:
-    """The cases of these names; without any, all but those whose format is slower than float32 here."""
+    """Return the named cases; by default all but those whose format is slower than float32 here."""
     if names is not None:
         return [case for case in CASES if case.name in names]
     if choose_precision("auto", choose_device("auto")) == "bf16":

@@ -1,11 +1,11 @@
-"""What tracking costs a training: `python -m benchmarks.overhead`.
+"""Measure the cost of tracking a training: `python -m benchmarks.overhead`.
 
-Two trainings of 16 environments take turns, one with the journal and the thread that mirrors it into a fresh MLflow
-store, one without. Both commit every `--commit-seconds`, far more often than by default, so the shares are upper
-bounds. The speeds differ by less than the machine's noise, so the cost is also timed: all calls of the tracker, with
-the files they write, and the processor time of the mirroring thread. The bookkeeping of an evaluation (histogram,
-tables, weights, but not its games) is timed once a turn and spread over the steps between two evaluations of the
-default config.
+Two trainings of 16 environments take turns, one with the journal and the thread that mirrors it in a new MLflow store,
+one without. Both commit every `--commit-seconds`, far more often than by default, so the shares are upper bounds. The
+speeds differ by less than the machine's noise. So the benchmark also times all calls of the tracker, with the files
+they write, and the processor time of the mirroring thread. Once a turn it times the bookkeeping of an evaluation
+(histogram, tables, weights, but not its games) and spreads it over the steps between two evaluations of the default
+config.
 """
 
 import argparse
@@ -35,7 +35,7 @@ _EPISODE_STEPS = 2_000  # of a random player; a good one plays many times longer
 
 
 class Turn(NamedTuple):
-    """A turn of a training: its speed, and where time went in seconds."""
+    """A turn of a training: its speed, and its costs in seconds."""
 
     steps_per_second: float
     seconds: float
@@ -45,7 +45,7 @@ class Turn(NamedTuple):
 
 
 class Timed:
-    """A tracker that adds up the time spent in its methods."""
+    """A tracker that adds up the time in its methods."""
 
     def __init__(self, tracker: Tracker) -> None:
         self.tracker = tracker
@@ -66,7 +66,7 @@ class Timed:
 
 @contextmanager
 def training(tracked: bool, commit_seconds: float) -> Iterator[Measure[Turn]]:
-    """A training that tells where its time goes; with the tracker that a run has, or with none."""
+    """A training that measures its costs, with a run's tracker or without one."""
     size, every = batch_of(_NUM_ENVS)
     config = training_config(
         size,
@@ -112,7 +112,7 @@ def training(tracked: bool, commit_seconds: float) -> Iterator[Measure[Turn]]:
 
 
 def evaluation_seconds(trainer: Trainer) -> float:
-    """The time that the bookkeeping of an evaluation takes: ending with one and a commit, and ending with a commit."""
+    """Return the time of an evaluation's bookkeeping: a training's end with it, less one without."""
     trainer.max_steps = trainer.counters.steps
     marks = [time.perf_counter()]
     for _ in range(2):
@@ -124,7 +124,7 @@ def evaluation_seconds(trainer: Trainer) -> float:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table and the JSON line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.overhead", description="what tracking costs")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.overhead", description="the cost of tracking")
     parser.add_argument("--rounds", type=int, default=5, help="turns of each training")
     parser.add_argument("--seconds", type=float, default=30.0, help="length of a turn")
     parser.add_argument("--commit-seconds", type=float, default=10.0, help="time between two commits")
@@ -171,7 +171,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _evaluation() -> Evaluation:
-    """What 100 episodes would hand over."""
+    """Return an evaluation of 100 episodes."""
     rng = np.random.default_rng()
     episodes = [
         Episode(

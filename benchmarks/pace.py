@@ -1,8 +1,8 @@
-"""What points a frame are made of, and where they are lost: `python -m benchmarks.pace`.
+"""Break down points a frame, and find where they are lost: `python -m benchmarks.pace`.
 
-A shipped network plays one game by its card's protocol, which is then played again to look at the screen before every
-decision: how often a ship, a vessel or a bomber, flies in each lane, and how often there is none. Ships appear in the
-top lane and come back a lane lower until they are hit.
+A shipped network plays one game by its card's protocol. A replay of it then looks at the screen before every decision:
+how often a ship, a vessel or a bomber, flies in each lane, and how often there is none. Ships appear in the top lane
+and come back a lane lower until they are hit.
 """
 
 import argparse
@@ -27,17 +27,17 @@ _SHOTS = 5  # pixels; a shot is one, the smallest ship twelve
 
 
 def ships(screen: npt.NDArray[np.uint8]) -> list[bool]:
-    """Whether a ship flies in each lane, from the top, of a screen in colour, (210, 160, 3)."""
+    """Return whether a ship flies in each lane, from the top, of a colour screen, (210, 160, 3)."""
     lanes = [screen[row : row + _ROWS].max(axis=-1).ravel() for row in _LANES]
     return [lane.size - int(np.bincount(lane).max()) > _SHOTS for lane in lanes]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the game in words and as a JSON line."""
+    """Print the game's figures in words and as a JSON line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.pace")
     parser.add_argument("--weights", default="pretrained/cnn_fast", help="a folder of exported weights")
-    parser.add_argument("--epsilon", type=float, help="1: chance alone; by default the card's")
-    parser.add_argument("--steps", type=int, default=27_000, help="of the game at most")
+    parser.add_argument("--epsilon", type=float, help="1: random play; by default the card's")
+    parser.add_argument("--steps", type=int, default=27_000, help="most steps of the game")
     args = parser.parse_args(arguments)
     print(f"about {args.steps / 9_000:.0f} minutes", file=sys.stderr, flush=True)
     actor, evaluator = player(args.weights, 1, args.steps)

@@ -1,9 +1,9 @@
-"""Memory and sampling cost of the replay memory under real play: `python -m benchmarks.replay`.
+"""Measure size and sampling time of the replay memory under real play: `python -m benchmarks.replay`.
 
-Random play is recorded once for each row and repeated until the memory holds `--transitions`; every observation is
-encoded anew. Each row has a process of its own, whose resident growth counts everything that the memory needs. Then
-sampling and the update that it feeds take turns in one process. Stable-Baselines3's buffer takes what its arrays take,
-so a small one tells the size of any.
+Each row records random play once and repeats it until the memory has `--transitions`, encoding every observation
+again. Each row has its own process, whose resident growth includes all that the memory needs. Then sampling and the
+update that it feeds take turns in one process. Stable-Baselines3's buffer is as large as its arrays, so a small one
+tells the size of any.
 """
 
 import argparse
@@ -32,7 +32,7 @@ _SB3_TRANSITIONS = 5_000
 
 
 class Case(NamedTuple):
-    """A kind of observation and what the memory may cost with it."""
+    """A kind of observation, and the allowed cost of a memory of it."""
 
     name: str
     model: str
@@ -51,7 +51,7 @@ RETURNS = Returns(0.99)
 
 
 class Arrival(NamedTuple):
-    """An observation and the step that led to it; no action: an episode's first."""
+    """An observation and the step that led to it; an episode's first has no action."""
 
     observation: npt.NDArray[np.uint8]
     action: int | None
@@ -81,7 +81,7 @@ def noise(size: int, steps: int) -> Iterator[Arrival]:
 
 
 def fill(memory: ReplayMemory, arrivals: Iterable[Arrival], transitions: int) -> None:
-    """Repeat `arrivals` until the memory holds `transitions` or has no more room."""
+    """Repeat `arrivals` until the memory has `transitions` or is full."""
     for observation, action, reward, terminated in itertools.cycle(arrivals):
         if action is None:
             memory.begin(0, observation)
@@ -97,7 +97,7 @@ def measure(case: Case, steps: int, transitions: int) -> dict[str, float]:
     arrivals = list(random_play(env, steps) if case.env else noise(env.size, steps))
     process = psutil.Process()
     resident_before = process.memory_info().rss
-    # Room for the observations that end an episode and are no transition's state.
+    # Room for the observations that end an episode, which begin no transition.
     memory = ReplayMemory(transitions + transitions // 100 + 5, (env.size, env.size), budget_bytes=case.budget_bytes)
     began = time.perf_counter()
     fill(memory, arrivals, transitions)
@@ -121,7 +121,7 @@ def measure(case: Case, steps: int, transitions: int) -> dict[str, float]:
 
 
 def measure_share(model: str, steps: int, transitions: int, rounds: int, seconds: float) -> dict[str, list[float]]:
-    """Samples and updates a second, in turns; updates of the precision that a run takes."""
+    """Return samples and updates a second, in turns; updates have a run's precision."""
     config = composed(f"model={model}")
     size = config.env.size
     memory = ReplayMemory(transitions + transitions // 100 + 5, (size, size), budget_bytes=config.replay.max_bytes)
@@ -144,7 +144,7 @@ def measure_share(model: str, steps: int, transitions: int, rounds: int, seconds
 
 
 def measure_sb3(size: int, batch_size: int, *, optimized: bool) -> tuple[float, float]:
-    """Bytes a transition of SB3's buffer and seconds a batch."""
+    """Return bytes a transition of SB3's buffer and seconds a batch."""
     from gymnasium.spaces import Box, Discrete
     from stable_baselines3.common.buffers import ReplayBuffer
 

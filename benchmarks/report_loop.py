@@ -1,8 +1,8 @@
-"""The report's own loop (figures 2.3 to 2.5, 3.1 and 3.2), transcribed as a peer to measure against.
+"""Transcribe the report's own loop (figures 2.3 to 2.5, 3.1 and 3.2), as a peer to measure against.
 
-One environment; stacks of float32 frames; a queue of Python objects; nothing added and nothing mended, its aliasing of
-state and next state included. What the report does not print is that of the code it descends from: the queue and how a
-batch is drawn from it.
+One environment; stacks of float32 frames; a queue of Python objects. Nothing is added or fixed, not even its aliasing
+of state and next state. The report does not print its queue and how it draws a batch: they come from the code that it
+builds on.
 """
 
 import random
@@ -116,14 +116,14 @@ class Loop:
 
 
 def preprocess_frame(screen: npt.NDArray[np.uint8]) -> Floats:
-    """Figure 2.3, without its crop, which the peers do not have: (210, 160, 3) to (84, 84)."""
+    """Figure 2.3, without its crop, which the peers lack: (210, 160, 3) to (84, 84)."""
     grey = cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY)
     scaled = np.ascontiguousarray(grey, dtype=np.float32) / 255
     return np.asarray(cv2.resize(scaled, (84, 84), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def stack_frame(stacked_frames: Floats | None, frame: Floats) -> Floats:
-    """Figure 2.3: the stack that comes in is the one that goes out."""
+    """Figure 2.3: it changes the stack in place and returns it."""
     if stacked_frames is None:
         return np.stack([frame] * 4)
     for index in range(3):

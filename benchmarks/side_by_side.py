@@ -1,7 +1,7 @@
-"""What a machine gains by training seeds at the same time: `python -m benchmarks.side_by_side`.
+"""Measure the gain of training seeds at the same time: `python -m benchmarks.side_by_side`.
 
-A training on all cores and several at a time, as many and with as many cores each as `decide` and sweeps choose here,
-take turns. Evaluations are left out. Seeds an hour are as steps a second, those of trainings at a time added up.
+One training on all cores takes turns with several at a time, as many and with as many cores each as `decide` and sweeps
+choose here. Evaluations are left out. Seeds an hour are proportional to steps a second, summed over the trainings.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from benchmarks.composition import composed
 from benchmarks.contest import Contestant, Measure, paired_ratio, print_rates, print_results, take_turns
 from benchmarks.training import learning, steps_per_second
 
-_WORK = (  # experiment=fast amid its training
+_WORK = (  # experiment=fast in mid-training
     *("experiment=fast", "training.learn_start=1_000", "epsilon=constant", "epsilon.value=0.05"),
     *("evaluation.every_steps=null", "evaluation.at_end=false"),
 )
@@ -30,7 +30,7 @@ def training(cores: int, overrides: Sequence[str]) -> Iterator[Measure[float]]:
 
 
 def together(contestants: Sequence[Contestant[float]], seconds: float) -> float:
-    """Let contestants work at the same time; return their steps a second, added up."""
+    """Let contestants work at the same time; return the sum of their steps a second."""
     for contestant in contestants:
         contestant.begin(seconds)
     return sum([contestant.finish() for contestant in contestants])

@@ -1,9 +1,8 @@
-"""What commands cost before they work: `python -m benchmarks.startup`.
+"""Measure the start-up time of commands: `python -m benchmarks.startup`.
 
-The processor time of each command, all its processes included, as a share of `python -c "import torch"`: help, a
-config to read, a misspelt key, `report` and `compare` of twelve runs, and `evaluate` up to the first step of a game.
-The commands take turns; shares are medians over rounds. Run it where all extras are installed, as it depends on what
-Hydra finds.
+It is the processor time of each command with all its processes, as a share of `python -c "import torch"`: help, a
+printed config, a misspelt key, `report` and `compare` of twelve runs, and `evaluate` up to the first step of a game.
+The commands take turns; shares are medians over rounds. Install all extras first, since Hydra searches for plugins.
 """
 
 import argparse
@@ -25,7 +24,7 @@ _RUNS = (  # twelve trainings of a second each
     *("replay.capacity=120", "training.learn_start=20", "training.batch_size=4", "evaluation.episodes=5"),
     *("evaluation.num_envs=1", "evaluation.video=false"),
 )
-_CODES = {"modl=cnn": 2}  # with which what is no failure ends
+_CODES = {"modl=cnn": 2}  # expected exit codes other than 0
 _UP_TO_A_STEP = """
 import sys
 from atlantis_exp import commands
@@ -40,7 +39,7 @@ commands.main()
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Start, measure, print."""
+    """Start, measure and print."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.startup")
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args(arguments)
@@ -69,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _seconds(*arguments: str) -> float:
-    """The processor time of a Python process and of those that it waited for. Raises: RuntimeError if it failed."""
+    """Return the processor time of a Python process and its children. Raises: RuntimeError if it failed."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     before = os.times()
     done = subprocess.run([sys.executable, *arguments], cwd=CHECKOUT, env=environment, capture_output=True, check=False)

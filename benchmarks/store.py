@@ -1,4 +1,4 @@
-"""`python -m benchmarks.store`: what the commands over many long runs cost: compare, a sweep's table, report, sync."""
+"""Measure commands over many long runs: compare, a sweep's table, report, sync: `python -m benchmarks.store`."""
 
 import argparse
 import dataclasses
@@ -36,7 +36,7 @@ MODELS = ("cnn", "resnet")
 
 
 def write_runs(outputs: Path, runs: int, episodes: int, distinct: int) -> list[Job]:
-    """Write the folders of finished trainings, with `distinct` journals among them that the others share by links."""
+    """Write folders of finished trainings, with `distinct` journals, to which the others link."""
     jobs = []
     journals: list[Path] = []
     bases = [composed(f"model={model}", f"paths.outputs={outputs}") for model in MODELS]
@@ -77,7 +77,7 @@ def write_runs(outputs: Path, runs: int, episodes: int, distinct: int) -> list[J
 
 
 def write_journal(path: Path, episodes: int, rng: np.random.Generator) -> None:
-    """Write a journal with the lines that a training writes."""
+    """Write a journal like a training's."""
     scores = 100.0 * rng.integers(20, 300, size=episodes) * np.linspace(0.5, 2.0, episodes)
     with open(path, "w") as file:
 
@@ -110,13 +110,13 @@ _MEANS = {"mean_20": 20, "mean_100": 100, "best_100": 100}
 
 
 def work_of(verb: Verb[Any], *overrides: str) -> Callable[[], object]:
-    """The work that a command line of a verb asks for, without Hydra."""
+    """Return the work of a verb's command line, without Hydra."""
     (config,) = check(verb.name, verb.schema, overrides).values()
     return verb.work(Asked(config, verb.name, overrides))
 
 
 def publish_nothing(outputs: Path) -> None:
-    """Note in every run's folder that the local store has it, which has a run without points."""
+    """Mark every run's folder as published to the local store, in which its run has no points."""
     store = Store(outputs)
     for path in outputs.glob("runs/*/commit.json"):
         folder = path.parent
@@ -145,7 +145,7 @@ def measure(command: Callable[[], object]) -> tuple[float, float, float]:
 
 
 def measure_publishing(runs: Path, outputs: Path) -> None:
-    """Publish copies of run folders in a new store and print what it costs, as a table and one line of JSON."""
+    """Publish copies of run folders to a new store; print the cost as a table and one line of JSON."""
 
     def sync() -> None:
         work_of(SYNC, f"paths.outputs={outputs}")()
@@ -164,7 +164,7 @@ def main(arguments: Sequence[str] = ()) -> None:
     parser.add_argument("--runs", type=int, default=1_000)
     parser.add_argument("--episodes", type=int, default=20_000)
     parser.add_argument("--distinct", type=int, default=20, help="journals; the other runs link to them")
-    parser.add_argument("--publish", type=Path, help="a folder of runs: measure only what publishing copies costs")
+    parser.add_argument("--publish", type=Path, help="a folder of runs: measure only publishing copies of them")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="store-", dir=".") as place:
         outputs = Path(place).resolve()
@@ -186,7 +186,7 @@ def main(arguments: Sequence[str] = ()) -> None:
             "report": lambda: work_of(REPORT, of)(),
             "sync": lambda: work_of(SYNC, of)(),
         }
-        measure(table)  # which gives the runs their parent
+        measure(table)  # gives the runs their parent
         publish_nothing(outputs)
         results = {name: measure(command) for name, command in commands.items()}
     print(f"{options.runs:,} runs of {options.episodes:,} episodes, journals of {size / 2**20:.1f} MiB\n")

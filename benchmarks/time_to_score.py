@@ -1,11 +1,11 @@
-"""Which score after which time, ours and the peers: `python -m benchmarks.time_to_score --minutes 180`.
+"""Compare scores by training time with the peers': `python -m benchmarks.time_to_score --minutes 180`.
 
-`experiment=fast` with DQNCnn, sb3-contrib's QR-DQN with RL Zoo's settings for Atari, and Stable-Baselines3's DQN with
-those of CleanRL's `dqn_atari.py` (whose loss is squared, not Huber's). Each is a process of its own that has all cores
-in its turn and rests while the others have theirs, as in `benchmarks.training`; after each turn its network plays a few
-games, at one epsilon for all and on the clock of none. All train and play in the game that the peers' settings are made
-for, `AtlantisNoFrameskip-v4`: four frames a step, up to 30 no-ops first, no sticky actions. Until the last turn games
-are cut after --cut steps, so that scores above are at least as shown.
+The contestants are `experiment=fast` with DQNCnn, sb3-contrib's QR-DQN with RL Zoo's settings for Atari, and
+Stable-Baselines3's DQN with those of CleanRL's `dqn_atari.py` (whose loss is squared, not Huber's). Each has its own
+process, all cores in its turn, and rests during the others' turns, as in `benchmarks.training`. After each turn its
+network plays a few games at the same epsilon, off the clock. All train and play the game of the peers' settings,
+`AtlantisNoFrameskip-v4`: four frames a step, up to 30 no-ops first, no sticky actions. Until the last turn games are
+cut after --cut steps, so marked scores are lower bounds.
 """
 
 import argparse
@@ -39,30 +39,30 @@ GAME = ("env=atlantis_standard", "env.sticky=0", "env.noop_max=30")  # AtlantisN
 GOALS = (25_240, 62_500)  # the report's best mean, and its best game
 
 _ACTIONS = 4
-_STEPS = 10_000_000  # that the peers' schedules are made for: RL Zoo's and CleanRL's
+_STEPS = 10_000_000  # of the peers' schedules: RL Zoo's and CleanRL's
 _CAPACITY = 400_000  # transitions; theirs is 1,000,000, which no run of hours fills and few machines hold
 _QUIET = Progress(Console(quiet=True))
 
 
 class Turn(NamedTuple):
-    """What a turn of training has led to."""
+    """The result of a turn of training."""
 
-    hours: float  # that this turn trained for
-    steps: int  # trained so far
+    hours: float  # of training in this turn
+    steps: int  # of training so far
     score: float  # mean
 
 
 @dataclass
 class Judge:
-    """Plays a few games with a network after each of so many turns."""
+    """Play a few games with a network after each turn."""
 
     episodes: int
-    cut: int  # steps of a game, but in the last turn
+    cut: int  # steps of a game, except in the last turn
     turns: int
     judged: int = 0
 
     def __call__(self, config: Config, q_values: Callable[[States], npt.NDArray[np.float32]]) -> float:
-        """The mean score in a config's environment, at its epsilon of evaluations."""
+        """Return the mean score in a config's environment, at its evaluation epsilon."""
         self.judged += 1
         env = config.env if self.judged == self.turns else replace(config.env, max_steps=self.cut)
         evaluator = build_evaluator(env, replace(config.evaluation, num_envs=self.episodes), here().cores)
@@ -90,7 +90,7 @@ def ours(judge: Judge) -> Iterator[Measure[Turn]]:
 
 @contextmanager
 def stable_baselines3(judge: Judge, make: Callable[[Any], Any]) -> Iterator[Measure[Turn]]:
-    """A model of SB3's in the environment that RL Zoo gives it."""
+    """An SB3 model in RL Zoo's environment."""
     import ale_py  # noqa: F401  # registers the environment
     import torch
     from stable_baselines3.common.env_util import make_atari_env
@@ -110,7 +110,7 @@ def stable_baselines3(judge: Judge, make: Callable[[Any], Any]) -> Iterator[Meas
 
     def measure(seconds: float) -> Turn:
         began = time.perf_counter()
-        # SB3 adds the steps so far to the total, which its schedules are a share of.
+        # SB3 adds the steps so far to the total, by which it scales its schedules.
         model.learn(
             _STEPS - model.num_timesteps,
             lambda *_: time.perf_counter() - began < seconds,
@@ -127,7 +127,7 @@ def stable_baselines3(judge: Judge, make: Callable[[Any], Any]) -> Iterator[Meas
 
 
 def sb3_qrdqn(env: Any) -> Any:
-    """RL Zoo's `hyperparams/qrdqn.yml` names no more than the wrapper, the stack and these."""
+    """All settings of RL Zoo's `hyperparams/qrdqn.yml` besides the wrapper and the stack."""
     from sb3_contrib import QRDQN
 
     return QRDQN("CnnPolicy", env, buffer_size=_CAPACITY, seed=0, **_THRIFTY)
@@ -168,26 +168,26 @@ PROGRAMS: dict[str, Callable[[Judge], AbstractContextManager[Measure[Turn]]]] = 
 
 
 def turn_of(name: str, contestant: Contestant[Turn], seconds: float) -> Turn:
-    """A turn of training; says what it led to, since hours of turns may be interrupted."""
+    """Train for a turn and print its result, since hours of turns may be interrupted."""
     turn = contestant.measure(seconds)
     print(f"{name}: {turn.score:,.0f} after {turn.steps:,} steps, {turn.hours:.3f} h more", file=sys.stderr, flush=True)
     return turn
 
 
 def hours_of(turns: Sequence[Turn]) -> float:
-    """The training of all turns."""
+    """Return the hours of all turns."""
     return sum(turn.hours for turn in turns)
 
 
 def hours_to(goal: float, turns: Sequence[Turn]) -> float:
-    """The training after which a score was first reached, infinite where it was not."""
+    """Return the hours until a score was first reached, or infinity."""
     hours = itertools.accumulate(turn.hours for turn in turns)
     return next((now for now, turn in zip(hours, turns, strict=True) if turn.score >= goal), math.inf)
 
 
 def sooner(goal: float, turns: dict[str, list[Turn]]) -> tuple[float, bool] | None:
-    """How many times sooner ours reached a score than the best peer, and whether it is at least so many, as no peer has
-    reached it; None where ours has not, or there are no peers."""
+    """Return how many times sooner ours reached a score than the best peer, and whether that is a lower bound, since no
+    peer has reached it; None if ours has not, or without peers."""
     reached = {name: hours_to(goal, each) for name, each in turns.items()}
     own = reached.pop("ours", math.inf)
     if math.isinf(own) or not reached:
@@ -198,7 +198,7 @@ def sooner(goal: float, turns: dict[str, list[Turn]]) -> tuple[float, bool] | No
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train in turns, print."""
+    """Train in turns and print."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.time_to_score")
     parser.add_argument("--contestants", nargs="*", choices=PROGRAMS, default=list(PROGRAMS))
     parser.add_argument("--minutes", type=float, default=6.0, help="training of each; for a result: 180")

@@ -1,10 +1,10 @@
-"""Training speed on the same work as the peers: `python -m benchmarks.training`.
+"""Compare training speed with the peers' on the same work: `python -m benchmarks.training`.
 
 All train Nature's network on whole 84x84 screens of ALE/Atlantis-v5 (skip 4, sticky 0.25, stack 4) with uniform
 replay, Adam, a target network copied every 10,000 steps and epsilon 0.05, and learn from 8 samples a step: batches of
-32 every 4 steps with one environment, of 128 every 16 steps with more. Each is a process of its own, has learning under
-way before it is measured, and rests while the others have their turns. Stable-Baselines3 has Gymnasium's
-`AtariPreprocessing`, an environment a process (with one environment: none), and `optimize_memory_usage`.
+32 every 4 steps with one environment, of 128 every 16 steps with more. Each has its own process, learns before it is
+measured, and rests during the others' turns. Stable-Baselines3 has Gymnasium's `AtariPreprocessing`, a process for each
+of several environments, and `optimize_memory_usage`.
 """
 
 import argparse
@@ -51,12 +51,12 @@ _WARM_UPDATES = 20
 
 
 def batch_of(num_envs: int) -> tuple[int, int]:
-    """Transitions in a batch and steps between two batches: 8 samples a step."""
+    """Return transitions in a batch and steps between two batches, for 8 samples a step."""
     return (32, 4) if num_envs == 1 else (128, 16)
 
 
 def training_config(batch_size: int, every: int, *overrides: str) -> Config:
-    """The common work as our config, with a batch of transitions every so many steps."""
+    """Return the common work as our config, with a batch of transitions every `every` steps."""
     return composed(
         "env=atlantis_standard",
         "optimizer=adam",
@@ -78,7 +78,7 @@ def training_config(batch_size: int, every: int, *overrides: str) -> Config:
 
 @contextmanager
 def learning(config: Config, tracker_of: Callable[[Path], Tracker] = Journal) -> Iterator[Trainer]:
-    """A trainer in a temporary folder that has begun to learn."""
+    """A learning trainer in a temporary folder."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         set_up_torch(config, config.device)
         trainer = build_trainer(
@@ -90,7 +90,7 @@ def learning(config: Config, tracker_of: Callable[[Path], Tracker] = Journal) ->
 
 
 def steps_per_second(trainer: Trainer, seconds: float) -> float:
-    """Speed over some seconds of training, without the commit at their end."""
+    """Return the speed over some seconds of training, without the final commit."""
     marks: list[tuple[float, int]] = []
 
     def stop() -> bool:
@@ -113,12 +113,12 @@ def ours(num_envs: int, precision: str = "auto", batch: tuple[int, int] | None =
 
 @contextmanager
 def ours_filled(transitions: int, play_steps: int) -> Iterator[Measure[float]]:
-    """Our trainer with 16 environments and a replay memory that holds repeated random play."""
+    """Our trainer with 16 environments and a replay memory of repeated random play."""
     size, every = batch_of(16)
     config = training_config(size, every, "env.num_envs=16", "replay.capacity=1_100_000")
     with learning(config) as trainer:
         fill(trainer.memory, list(random_play(config.env, play_steps)), transitions)
-        for env in range(16):  # what they played before the filling is too far back to go on from
+        for env in range(16):  # their earlier play is too far back to continue
             trainer.memory.begin(env, trainer.stack.state[env, -1])
         yield functools.partial(steps_per_second, trainer)
 
@@ -188,7 +188,7 @@ CONTESTANTS: dict[str, Program] = {
 
 @contextmanager
 def neighbours(count: int) -> Iterator[None]:
-    """Processes that want a core each, all the time."""
+    """Run processes that keep a core busy each."""
     busy = [subprocess.Popen((sys.executable, "-c", "while True: pass")) for _ in range(count)]
     try:
         yield
@@ -199,7 +199,7 @@ def neighbours(count: int) -> Iterator[None]:
 
 
 def contest(programs: dict[str, Program], rounds: int, seconds: float, busy: int) -> dict[str, list[float]]:
-    """The rates of programs that all live at once and work in turns, with busy neighbours."""
+    """Return the rates of programs that exist at once and work in turns, beside busy neighbours."""
     with ExitStack() as stack:
         contestants = {name: stack.enter_context(Contestant(program)) for name, program in programs.items()}
         turns = {name: functools.partial(one.measure, seconds) for name, one in contestants.items()}

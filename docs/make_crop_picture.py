@@ -1,4 +1,4 @@
-"""Draw `docs/images/crop.png`: the crop on a real frame, and what the networks see of it.
+"""Draw `docs/images/crop.png`: the crop on a real frame, and the networks' views of it.
 
 `python docs/make_crop_picture.py`, from the root of the checkout; the same picture at every call.
 """
@@ -19,11 +19,11 @@ from atlantis_exp.game.atlantis import Atlantis
 
 SIZES = (84, 159)  # of DQNCnn and ResNetDQN, pixels
 LANES = (19, 40, 61, 82)  # first rows of the ships' lanes
-STEPS = 175  # of random play, after which ships are about
+STEPS = 175  # of random play, until ships appear
 
 
 def main() -> None:
-    """Play, and draw the frame beside both observations of it."""
+    """Play, and draw the frame beside its two observations."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         env = checked(QueryConfig, compose("query")).env
     up, right, down, left = env.crop

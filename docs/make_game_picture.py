@@ -16,11 +16,11 @@ from atlantis_exp.sessions.cards import build_exported_actor, read_card
 from atlantis_exp.training.evaluation import evaluate
 from atlantis_exp.training.film import Moment, moments
 
-STEPS = 1_500  # that are played
+STEPS = 1_500  # to play
 
 
 def main() -> None:
-    """Play, and draw the latest moments at which the network and chance decided, left and right."""
+    """Play, and draw the latest decisions of the network and of chance, left and right."""
     card, weights = read_card(Path("pretrained/cnn_fast"))
     env = dataclasses.replace(card.config.env, max_steps=STEPS, workers=1)
     actor = build_exported_actor(card.config, weights, "cpu")

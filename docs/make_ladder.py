@@ -1,7 +1,7 @@
 """Draw `docs/images/ladder.png` from `docs/data/ladder.csv` and print the table of lab/results.md.
 
-`python docs/make_ladder.py [OUTPUTS...]`, from the root of the checkout. The finished trainings in the folders OUTPUTS
-enter the data first, in the place of what it has of runs of the same names.
+`python docs/make_ladder.py [OUTPUTS...]`, from the root of the checkout. First it adds the finished trainings in the
+folders OUTPUTS to the data, replacing runs of the same names.
 """
 
 import csv
@@ -23,12 +23,12 @@ from atlantis_exp.statistics import interquartile_mean
 DATA = Path("docs/data/ladder.csv")
 COLUMNS = ("run", "command", "commit", "updates", "hours", "steps", "training", "evaluation")
 EVERY = 5_000  # steps between two points of a curve
-# What is said once, above the table.
+# Options that the text above the table gives once.
 COMMON = ("seed=", "threads=", "env.workers=", "phase=brief", "evaluation.")
 
 
 def main(outputs: Sequence[Path]) -> None:
-    """Bring the data up to date, draw it, and print every run's mean with its interval."""
+    """Update the data, draw it, and print every run's mean with its interval."""
     runs = [run for folder in outputs for run in all_runs(folder) if run.result]
     rows = updated(DATA, COLUMNS, {run.name for run in runs}, map(row_of, runs), lambda row: (label(row), row["run"]))
     ladder = [row for row in rows if "experiment=ablation" in row["command"]]
@@ -42,7 +42,7 @@ def main(outputs: Sequence[Path]) -> None:
 
 
 def row_of(run: RunFolder) -> Row:
-    """A finished training: what it was asked, what it took, its curve and every evaluated score."""
+    """Return a finished training's row: its command, costs, curve and evaluated scores."""
     assert run.result is not None
     tags = {
         key: value for _, record in read(run.path) if isinstance(record, Tags) for key, value in record.values.items()
@@ -66,7 +66,7 @@ def row_of(run: RunFolder) -> Row:
 
 
 def label(row: Row) -> str:
-    """What sets a run's command apart."""
+    """Return the distinctive part of a run's command."""
     words = [word for word in row["command"].split() if not word.startswith(COMMON)]
     return " ".join(words).removeprefix("experiment=").removeprefix("ablation_")
 
@@ -76,7 +76,7 @@ def numbers(text: str) -> npt.NDArray[np.float64]:
 
 
 def estimates(row: Row) -> tuple[npt.NDArray[np.float64], tuple[float, float]]:
-    """The evaluated scores, and the bootstrap's 95 % interval of their mean over episodes."""
+    """Return the evaluated scores, and the bootstrap's 95 % interval of their mean over episodes."""
     scores, rng = numbers(row["evaluation"]), np.random.default_rng(0)
     drawn = (rng.integers(np.full(scores.size, scores.size)) for _ in range(2_000))
     low, high = np.percentile([scores[chosen].mean() for chosen in drawn], (2.5, 97.5))
@@ -84,7 +84,7 @@ def estimates(row: Row) -> tuple[npt.NDArray[np.float64], tuple[float, float]]:
 
 
 def draw(ladder: Sequence[Row], branches: Sequence[Row]) -> None:
-    """Curves of the rungs and of the branches, and the means of all."""
+    """Draw curves of the rungs and of the branches, and the means of all."""
     figure = Figure(figsize=(13, 6.5), dpi=100, layout="constrained")
     panels = figure.subplots(1, 3, width_ratios=(1, 1, 1.2))
     means = panels[2]

@@ -1,7 +1,7 @@
 """Draw `docs/images/fast.png` from `docs/data/fast.csv`: scores by steps and by hours.
 
-`python docs/make_results_picture.py [OUTPUTS...]`, from the root of the checkout. The trainings in the
-folders OUTPUTS enter the table first, in the place of what it has of runs of the same names.
+`python docs/make_results_picture.py [OUTPUTS...]`, from the root of the checkout. First it adds the trainings in the
+folders OUTPUTS to the table, replacing runs of the same names.
 """
 
 import sys
@@ -31,7 +31,7 @@ EVERY = 10_000  # steps between two rows of the table; evaluations have rows of 
 
 
 def main(outputs: Sequence[Path]) -> None:
-    """Bring the table up to date and draw a line a run, in its colour everywhere, with a point for each evaluation."""
+    """Update the table and draw a line a run, in a constant colour, with a point for each evaluation."""
     rows = rows_with(outputs, Path("docs/data/fast.csv"))
 
     figure = Figure(figsize=(11, 4.5), dpi=100, layout="constrained")
@@ -55,19 +55,19 @@ def main(outputs: Sequence[Path]) -> None:
 
 
 def rows_with(outputs: Sequence[Path], table: Path) -> list[dict[str, str]]:
-    """A table's rows, once the trainings in some outputs folders have entered it."""
+    """Add the trainings in outputs folders to a table; return its rows."""
     runs = [run for folder in outputs for run in all_runs(folder)]
     new = (dict(zip(COLUMNS, row, strict=True)) for run in runs for row in rows_of(run))
     return updated(table, COLUMNS, {run.name for run in runs}, new, lambda row: (row["run"],))
 
 
 def columns(rows: list[dict[str, str]], x: str, y: str, unit: float) -> tuple[list[float], list[float]]:
-    """Two columns as numbers."""
+    """Return two columns as numbers."""
     return [float(row[x]) / unit for row in rows], [float(row[y]) for row in rows]
 
 
 def rows_of(run: RunFolder) -> Iterator[list[str]]:
-    """The table's rows of a run, as far as it is committed."""
+    """Yield a run's committed rows of the table."""
     commit = read_commit(run.path)
     if commit is None:  # only begun
         return

@@ -1,8 +1,8 @@
 """Draw `docs/images/NAME.png` from `docs/data/NAME.csv`: scores in the field's game next to published curves.
 
 `python docs/make_standard_picture.py NAME [OUTPUTS...]`, from the root of the checkout, where NAME is `standard`,
-`rewards` or `million`. The trainings in the folders OUTPUTS enter the table first, in the place of what it has of runs
-of the same names.
+`rewards` or `million`. First it adds the trainings in the folders OUTPUTS to the table, replacing runs of the same
+names.
 """
 
 import sys
@@ -29,7 +29,7 @@ FRAMES = 4  # a step
 
 
 def main(name: str, outputs: Sequence[Path]) -> None:
-    """Bring the table up to date and draw a line a training, with a point for each evaluation."""
+    """Update the table and draw a line a training, with a point for each evaluation."""
     rows = rows_with(outputs, Path(f"docs/data/{name}.csv"))
     figure = Figure(figsize=(7, 4.5), dpi=100, layout="constrained")
     axes = figure.subplots()

@@ -1,7 +1,7 @@
 """Draw `docs/images/NAME.png` from `docs/data/NAME.csv`: scores of our recipe and of peers by training time.
 
-`python docs/make_time_picture.py NAME [OUTPUTS...]`, from the root of the checkout. OUTPUTS are files with what
-`python -m benchmarks.time_to_score` printed, whose curves then take the table's place.
+`python docs/make_time_picture.py NAME [OUTPUTS...]`, from the root of the checkout. OUTPUTS are files with the output
+of `python -m benchmarks.time_to_score`, whose curves then replace the table.
 """
 
 import csv
@@ -27,7 +27,7 @@ SHOWN = {
 
 
 def take_over(outputs: Sequence[Path], table: Path) -> None:
-    """Write the table anew from what the benchmark printed."""
+    """Rewrite the table from the benchmark's output."""
     with table.open("w", newline="") as file:
         rows = csv.writer(file, lineterminator="\n")
         rows.writerow(COLUMNS)
@@ -40,7 +40,7 @@ def take_over(outputs: Sequence[Path], table: Path) -> None:
 
 
 def main(name: str, outputs: Sequence[Path]) -> None:
-    """Bring the table up to date; draw a line a program, and the goals."""
+    """Update the table; draw a line a program, and the goals."""
     table = Path(f"docs/data/{name}.csv")
     if outputs:
         take_over(outputs, table)

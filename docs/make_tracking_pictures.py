@@ -1,4 +1,4 @@
-"""Takes the pictures of MLflow's pages in docs/tracking.md: `python docs/make_tracking_pictures.py OUTPUTS`.
+"""Take the pictures of MLflow's pages in docs/tracking.md: `python docs/make_tracking_pictures.py OUTPUTS`.
 
 OUTPUTS is a folder of runs whose store is published, with a sweep and a comparison. Needs playwright and a Chromium.
 """
@@ -23,7 +23,7 @@ SECONDS = 8  # until a page's charts are drawn
 
 def take(page: Page, place: str, name: str) -> None:
     """Open a place and write its picture."""
-    page.goto("about:blank")  # else only the part behind '#' changes, and the application begins with the old view
+    page.goto("about:blank")  # else only the part after '#' changes, and the application keeps the old view
     page.goto(place)
     page.wait_for_timeout(1_000 * SECONDS)
     page.screenshot(path=IMAGES / f"mlflow_{name}.png")
@@ -31,7 +31,7 @@ def take(page: Page, place: str, name: str) -> None:
 
 
 def main() -> None:
-    """Serve, open, take, end."""
+    """Serve the store and take the pictures."""
     outputs = Path(sys.argv[1]).absolute()
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

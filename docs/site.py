@@ -1,6 +1,6 @@
-"""Gather the pages of the site in `.site/`: docs/, README, CONTRIBUTING, CHANGELOG, lab/, and the helps of the verbs.
+"""Gather the pages of the site in `.site/`: docs/, README, CONTRIBUTING, CHANGELOG, lab/, and the verbs' help.
 
-`python docs/site.py`, from the root of the checkout; then `mkdocs build` makes `site/` of them (`make docs`).
+`python docs/site.py`, from the root of the checkout; then `mkdocs build` builds `site/` from them (`make docs`).
 """
 
 import re
@@ -13,7 +13,7 @@ from atlantis_exp.commands.helping import help_text, options_of, overview
 
 ROOT = Path(__file__).resolve().parents[1]
 WHOLE = {"README": "index.md", "CONTRIBUTING": "contributing.md", "CHANGELOG": "changelog.md"}
-"""Pages of the repository's root, and what they are called in the site."""
+"""Pages of the repository's root, and their names on the site."""
 
 
 def main(target: Path) -> None:
@@ -34,7 +34,7 @@ def main(target: Path) -> None:
 
 
 def in_the_site(text: str, name: str) -> str:
-    """Lead the links of a page to their places in the site; one to another part of the repository becomes its text."""
+    """Point the links of a page to the site; replace those to other parts of the repository by their text."""
     up = "../" * name.count("/")
     for source, page in WHOLE.items():
         text = re.sub(rf"\]\((?:\.\./)?{source}\.md", f"]({up}{page}", text)
@@ -45,10 +45,10 @@ def in_the_site(text: str, name: str) -> str:
 
 
 def verbs() -> str:
-    """Return the page of the verbs: the help of each."""
+    """Return the page with the help of each verb."""
     parts = [
         "# Verbs",
-        "This page has the help of every verb, as `python -m atlantis_exp VERB --help` prints it.",
+        "The help of every verb, as `python -m atlantis_exp VERB --help` prints it.",
         block(overview()),
     ]
     for verb in VERBS:
@@ -57,25 +57,25 @@ def verbs() -> str:
 
 
 def block(text: str) -> str:
-    """Return a text as it is."""
+    """Return a text as a code block."""
     return f"```text\n{text}\n```"
 
 
 def keys() -> str:
-    """Return the page of the keys of a training: its own, then those of each option of each group."""
+    """Return the page of a training's keys: its own, then those of each option of each group."""
     text = help_text("train", ["all"])
     groups = re.findall(r"^(\w+)=(\w+)   \(", text, re.MULTILINE)
     own = text.partition("\nKeys:\n")[2].partition("\n\n")[0]
     parts = [
         "# Keys",
-        "This page lists every key of a config with its value. `python -m atlantis_exp KEY=VALUE` sets one, "
-        "`--cfg job` prints all. [Verbs](verbs.md) has the keys of the verbs.",
+        "All keys of a config with their values. `python -m atlantis_exp KEY=VALUE` sets one, `--cfg job` prints all. "
+        "[Verbs](verbs.md) has the keys of the verbs.",
         table(own),
     ]
     for group, default in groups:
         parts.append(f"## {group}")
         options = options_of(group)
-        parts.append(f"Options: {', '.join(f'`{option}`' for option in options)}; `{default}` unless another is named.")
+        parts.append(f"Options: {', '.join(f'`{option}`' for option in options)}; the default is `{default}`.")
         seen = set[str]()
         for option in [default, *(each for each in options if each != default)]:
             shown = help_text("train", [f"{group}={option}"])
@@ -88,7 +88,7 @@ def keys() -> str:
 
 
 def table(lines: str) -> str:
-    """Return the lines of a help as a table of keys, values and sentences."""
+    """Return the lines of a help text as a table of keys, values and sentences."""
     shown = ["| key | value | |", "| --- | --- | --- |"]
     shown += [
         f"| `{key}` | {f'`{value}`' if value else ''} | {sentence.replace('|', chr(92) + '|')} |"
@@ -98,7 +98,7 @@ def table(lines: str) -> str:
 
 
 def rows(lines: str) -> Iterator[tuple[str, str, str]]:
-    """Yield key, value and sentence of each key of a help; a sentence may go on in the next lines."""
+    """Yield key, value and sentence of each key of a help text; a sentence may span several lines."""
     row: list[str] = []
     for line in lines.splitlines():
         if match := re.fullmatch(r"  ([\w.]+)(?:=(.*?))?(?:  +(.*))?", line):

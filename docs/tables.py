@@ -1,4 +1,4 @@
-"""What the scripts beside it share: the tables in docs/data, and the random player."""
+"""Update the tables in docs/data, for the scripts beside it."""
 
 import csv
 from collections.abc import Callable, Collection, Iterable, Sequence
@@ -16,7 +16,7 @@ def updated(
     rows: Iterable[Row],
     key: Callable[[Row], tuple[str, ...]],
 ) -> list[Row]:
-    """A table's rows by `key`, once `rows` have taken the place of what it had of the runs of these names."""
+    """Replace the rows of the named runs in a table; return all rows sorted by `key`."""
     known = table.read_text().splitlines() if table.exists() else []
     kept = [row for row in csv.DictReader(known) if row["run"] not in runs]
     merged = sorted([*kept, *rows], key=key)

@@ -1,11 +1,11 @@
-"""A game: Breakout on ALE. Nothing presses FIRE for the player: a ball starts when the network, or chance, does."""
+"""A game: Breakout on ALE. Nothing presses FIRE for the player: only a chosen FIRE starts a ball."""
 
 from atlantis_exp.components import component
 
 
 @component("breakout", "env")
 class Breakout:
-    """A life is a ball of five; bricks pay 1, 4 or 7 points, 864 in all."""
+    """Each of five balls is a life; bricks score 1, 4 or 7 points, 864 in all."""
 
     actions = ("NOOP", "FIRE", "RIGHT", "LEFT")
     score_range = (0.0, 864.0)

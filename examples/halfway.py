@@ -1,4 +1,4 @@
-"""A schedule, of epsilon or of the learning rate: from one value to another in one step, halfway."""
+"""A schedule for epsilon or the learning rate: switch from one value to another halfway."""
 
 from dataclasses import dataclass
 

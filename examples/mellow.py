@@ -1,4 +1,4 @@
-"""An objective: the target values the next state by a soft maximum of its actions' values (mellowmax)."""
+"""An objective: value the next state by a soft maximum of its actions' values (mellowmax)."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from atlantis_exp.learning.objectives import DQN, QFunction, bootstrapped
 @component("mellow", "objective")
 @dataclass(frozen=True)
 class MellowObjective(DQN):
-    """DQN with mellowmax in the place of the maximum (Asadi and Littman 2017)."""
+    """DQN with mellowmax in place of the maximum (Asadi and Littman 2017)."""
 
     omega: Positive = 5.0
 

@@ -1,4 +1,4 @@
-"""A sampler: transitions whose reward was not zero come more often."""
+"""A sampler: prefer transitions with a reward other than zero."""
 
 from typing import Annotated, Any
 
@@ -13,7 +13,7 @@ from atlantis_exp.replay.samplers import Draw
 
 @component("paying", "sampler")
 class PayingSampler:
-    """Of `tries` draws for each place of a batch, the first whose reward is not zero, else the last."""
+    """For each place of a batch draw `tries` times; take the first transition with a reward, else the last."""
 
     def __init__(self, *, tries: Annotated[int, Interval(ge=1, le=16)] = 2) -> None:
         self.tries = tries

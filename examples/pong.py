@@ -1,4 +1,4 @@
-"""A game: Pong on ALE, whose score may be negative: a point for oneself less one for the other, up to 21."""
+"""A game: Pong on ALE. Its score, points won less points lost, may be negative; a game ends at 21."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ from atlantis_exp.components import component
 
 @component("pong", "env")
 class Pong:
-    """There are no lives; RIGHT is up."""
+    """Pong has no lives; RIGHT is up."""
 
     actions = ("NOOP", "FIRE", "RIGHT", "LEFT", "RIGHTFIRE", "LEFTFIRE")
     score_range = (-21.0, 21.0)
@@ -19,5 +19,5 @@ class Pong:
 
     @staticmethod
     def points(reward: int, ram: Sequence[int]) -> Sequence[float]:
-        """The parts of a frame's reward, as `sources`; `ram` is the console's 128 bytes after the frame."""
+        """Split a frame's reward by `sources`; `ram` is the console's 128 bytes after the frame."""
         return max(reward, 0), min(reward, 0)

@@ -1,4 +1,4 @@
-"""A network: two small residual blocks behind a stem that shrinks the screen."""
+"""A network: two small residual blocks after a stem that shrinks the screen."""
 
 from typing import Annotated
 

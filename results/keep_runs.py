@@ -1,8 +1,8 @@
 """Copy finished runs, comparisons and decisions in the smallest form that `compare`, `sync` and `load_runs` read.
 
-`python results/keep_runs.py OUTPUTS TARGET`: each folder beside this file is such a target. Weights, films, pages and
-this machine's paths are left out, and so are comparisons without a look. Of a training's curve a point every 5,000
-steps stays, with five digits, and the whole of the last 10,000 steps.
+`python results/keep_runs.py OUTPUTS TARGET` leaves out weights, films, pages, this machine's paths, and comparisons
+without a look. It keeps a point of a training's curve every 5,000 steps, with five digits, and all of the last 10,000
+steps. Each folder beside this file is such a target.
 """
 
 import json
@@ -23,7 +23,7 @@ WHOLE = 10_000  # steps at the end that keep every point
 
 
 def main(outputs: Path, target: Path) -> None:
-    """Copy each finished run, comparison and decision of an outputs folder, replacing what has its name."""
+    """Copy each finished run, comparison and decision of an outputs folder, replacing those of the same name."""
     for run in all_runs(outputs):
         if run.result is not None:
             keep(run, RUN, target, run.result.steps)
@@ -35,7 +35,7 @@ def main(outputs: Path, target: Path) -> None:
 
 
 def keep(run: RunFolder, names: Sequence[str], target: Path, steps: int = 0) -> None:
-    """Copy a folder; its outputs folder is then called `outputs`, and it belongs to no sweep."""
+    """Copy a folder, name its outputs folder `outputs`, and detach it from its sweep."""
     place = bytes(run.path.parents[1].absolute())
     target = target / run.path.parent.name / run.name
 
@@ -59,11 +59,11 @@ def keep(run: RunFolder, names: Sequence[str], target: Path, steps: int = 0) -> 
 
 
 def thinned(journal: bytes, steps: int, files: Collection[str]) -> bytes:
-    """Return a journal with fewer points of its training's curve, only the last note, and no file that is not kept."""
+    """Return a journal with fewer points of its training's curve, only the last note, and only kept files."""
     lines, records = journal.splitlines(keepends=True), [json.loads(line) for line in journal.splitlines()]
     last_note = max((at for at, record in enumerate(records) if NOTE in record.get("values", {})), default=-1)
     first = next((at for at, record in enumerate(records) if is_of_the_curve(record)), -1)
-    kept, taken = list[bytes](), -1  # the cell of the grid that has its point
+    kept, taken = list[bytes](), -1  # the latest cell of the grid with a point
     for at, (line, record) in enumerate(zip(lines, records, strict=True)):
         if record["kind"] in ("image", "model") or (set(record.get("values", {})) == {NOTE} and at != last_note):
             continue
@@ -80,12 +80,12 @@ def thinned(journal: bytes, steps: int, files: Collection[str]) -> bytes:
 
 
 def is_of_the_curve(record: dict[str, Any]) -> bool:
-    """Tell whether a record is a point of a training's curve and not of an evaluation at the same step."""
+    """Return whether a record is a point of a training's curve, not of an evaluation at the same step."""
     return record["kind"] == "metrics" and "throughput/hours" in record["values"]
 
 
 def shortened(record: dict[str, Any]) -> bytes:
-    """Return a record's line; its fractions have five digits."""
+    """Return a record's line, with fractions of five digits."""
     values = {key: value if value == int(value) else float(f"{value:.5g}") for key, value in record["values"].items()}
     return json.dumps(record | {"values": values}, separators=(",", ":")).encode() + b"\n"
 

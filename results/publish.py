@@ -1,7 +1,7 @@
 """Compute every published number from the kept runs, tables and cards into `results/numbers.json`.
 
-`python -m results.publish` writes that file and the tables between `<!-- NAME -->` and `<!-- end -->` of the pages.
-The file leads from a page to its numbers, as text: `tests/test_results.py` looks for each on the page.
+`python -m results.publish` writes that file and the tables between `<!-- NAME -->` and `<!-- end -->` in the pages.
+The file maps each page to its numbers, as text; `tests/test_results.py` looks for them on the page.
 """
 
 import csv
@@ -38,7 +38,7 @@ LAB, REPRODUCTION, ASKED = "lab/results.md", "lab/reproduction.md", "lab/questio
 
 
 def games_at(run: RunFolder, step: int | None = None) -> EpisodeTable:
-    """Return the games that a kept run played after a step, by default its last."""
+    """Return a kept run's games after a step, by default its last."""
     assert run.result is not None
     return EpisodeTable.read(run.artifact(evaluation_at(step or run.result.steps)), SOURCES)
 
@@ -50,13 +50,13 @@ def of_the_verdict(model: str, sampler: str = "uniform", precision: str = "fp32"
 
 
 def in_the_fields_game() -> list[EpisodeTable]:
-    """Return the games of three trainings with rewards of at most 1; the second has only its games."""
+    """Return the games of three trainings with rewards of at most 1; only games are kept of the second."""
     first, third = sorted(KEPT["standard"], key=lambda run: run.name.split("-")[2])
     return [games_at(first), EpisodeTable.read(RESULTS / "standard" / "seed_1.csv", SOURCES), games_at(third)]
 
 
 def to_a_power(question: str) -> list[RunFolder]:
-    """Return the trainings in the field's game from rewards to a power, by seed."""
+    """Return the trainings in the field's game with rewards to a power, by seed."""
     configs = [(run, run.trained_config) for run in KEPT[question]]
     there = [(run, each) for run, each in configs if each.env.id == "ALE/Atlantis-v5"]
     return [run for run, each in sorted(there, key=lambda pair: pair[1].seed) if each.objective.reward_exponent < 1]
@@ -69,25 +69,25 @@ def metrics_of(run: RunFolder, name: str) -> list[float]:
 
 
 def ends_of(run: RunFolder) -> list[tuple[int, int]]:
-    """Return at which step each game of a training ended, and its length in steps."""
+    """Return the last step and the length of each game of a training."""
     with run.artifact("episodes.csv").open() as file:
         return [(int(row["step"]), int(row["length"])) for row in csv.DictReader(file)]
 
 
 def at_step(run: RunFolder, step: int, table: str) -> tuple[float, float]:
-    """Return the hours until a step and the mean of 20 there, from a table in docs/data."""
+    """Return the hours until a step and its mean of 20, from a table in docs/data."""
     with (DATA / f"{table}.csv").open() as file:
         row = next(row for row in csv.DictReader(file) if row["run"] == run.name and int(row["step"]) == step)
     return float(row["hours"]), float(row["mean_20"])
 
 
 def mean_and_iqm(games: EpisodeTable) -> str:
-    """Return the scores as the tables have them."""
+    """Format the scores for the tables."""
     return f"{games.scores.mean():,.0f} ({interquartile_mean(games.scores):,.0f})"
 
 
 def hits_of(games: EpisodeTable) -> dict[str, float]:
-    """Return how often each source of points was hit."""
+    """Return the number of hits by source of points."""
     return dict(zip(pace.PAID, np.divide(games.points.sum(axis=0)[:-1], [*pace.PAID.values()]), strict=True))
 
 
@@ -101,13 +101,13 @@ def pace_of(games: EpisodeTable) -> tuple[float, ...]:
 
 
 def side_share(games: EpisodeTable) -> float:
-    """Return how many percent of the bombers are hit by side guns."""
+    """Return the percentage of bomber hits by side guns."""
     hits = hits_of(games)
     return 100 * hits["side_bomber"] / (hits["side_bomber"] + hits["centre_bomber"])
 
 
 def whole(values: Iterable[Any]) -> list[str]:
-    """Return numbers as pages have them."""
+    """Format numbers for the pages."""
     return [f"{value:,.0f}" for value in values]
 
 
@@ -296,14 +296,14 @@ SECTIONS = (
 
 @cache
 def numbers() -> dict[str, list[str]]:
-    """Return every published number, by page."""
+    """Return all published numbers by page."""
     said = list(dict.fromkeys(itertools.chain.from_iterable(section() for section in SECTIONS)))
     return {page: [text for of, text in said if of == page] for page in (LAB, REPRODUCTION, ASKED)}
 
 
 @cache
 def tables() -> dict[str, str]:
-    """Return the tables of the pages, by the name in the comment before each."""
+    """Return the tables of the pages by the name in their comments."""
     answers = ["| trainings | seeds | mean | lowest | highest |", "| --- | ---: | ---: | ---: | ---: |"]
     for model, network in (("cnn", "DQNCnn"), ("resnet_fast", "ResNetFast")):
         for sampler in ("uniform", "top_half"):
@@ -334,7 +334,7 @@ def tables() -> dict[str, str]:
 
 
 def with_tables(page: str, tables: Mapping[str, str]) -> str:
-    """Return a page with each table between its comments."""
+    """Insert the tables between their comments on a page."""
 
     def filled(found: re.Match[str]) -> str:
         return f"<!-- {found[1]} -->\n\n{tables[found[1]]}\n\n<!-- end -->"

@@ -39,10 +39,10 @@ from atlantis_exp.training.trainer import Trainer
 
 Serving = AbstractContextManager[None]
 
-settings.register_profile("untimed", deadline=None)  # a busy machine is no failure
+settings.register_profile("untimed", deadline=None)  # a busy machine must not fail a test
 settings.load_profile("untimed")
 
-TINY = (  # everything that a training can do, in seconds
+TINY = (  # all features of a training, in seconds
     *("experiment=quick", "device=cpu", "threads=1", "budget.forecast=off"),
     *("tracking=none", "tracking.every_steps=20", "tracking.histogram_episodes=500"),
     *("env.size=40", "env.max_steps=40", "phase.quick.steps=160", "replay.capacity=120", "replay.max_bytes=4_194_304"),
@@ -64,7 +64,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def free_port() -> Callable[[], int]:
-    """A port that nobody listens to."""
+    """Return a function that finds a free port."""
 
     def found() -> int:
         with socket.socket() as probe:
@@ -77,7 +77,7 @@ def free_port() -> Callable[[], int]:
 
 @pytest.fixture(scope="session")
 def answering() -> Callable[..., None]:
-    """Waits for an MLflow server: `answering(process, port)`."""
+    """Return a function that waits for an MLflow server: `answering(process, port)`."""
 
     def wait(process: "subprocess.Popen[Any]", port: int, seconds: float = 120) -> None:
         patience = time.monotonic() + seconds
@@ -95,9 +95,9 @@ def answering() -> Callable[..., None]:
 
 @pytest.fixture(scope="session")
 def mlflow_tables(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], None]:
-    """Puts a database with MLflow's tables into a folder that has none: `mlflow_tables(folder)`.
+    """Return a function that gives a folder a database with MLflow's tables: `mlflow_tables(folder)`.
 
-    To make them takes seconds, to copy them does not: all of a session are copies of one, which its workers share.
+    Creating them takes seconds, so a session's workers copy a shared one.
     """
     own = tmp_path_factory.getbasetemp()
     template = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "tables.db"
@@ -127,9 +127,9 @@ def mlflow_tables(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], 
 
 @pytest.fixture(scope="session", autouse=True)
 def _logs_stay_open() -> Iterator[None]:
-    """A command in this process closes no handler of others: pytest's stderr would go with absl's."""
+    """Keep logging handlers open when a command runs in this process: pytest's stderr would close with absl's."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(logging, "shutdown", lambda *_: None)  # by which Hydra begins
+        patched.setattr(logging, "shutdown", lambda *_: None)  # Hydra calls it first
         yield
 
 
@@ -141,10 +141,10 @@ _connect = _CONNECTION.func
 def _stores_have_tables(
     tmp_path_factory: pytest.TempPathFactory, mlflow_tables: Callable[[Path], None]
 ) -> Iterator[None]:
-    """Local stores of this process, under pytest's folder, find their tables made."""
+    """Give local stores of this process, in pytest's folder, their tables."""
 
     def connect(store: Store) -> object:
-        with suppress(OSError):  # which the store itself is to meet
+        with suppress(OSError):  # left to the store itself
             if store.is_local and store._root.is_relative_to(tmp_path_factory.getbasetemp()):
                 mlflow_tables(store._root)
         return _connect(store)
@@ -156,13 +156,13 @@ def _stores_have_tables(
 
 @pytest.fixture
 def stores_without_tables(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stores make their own tables, as outside of tests."""
+    """Let stores create their own tables, as outside of tests."""
     monkeypatch.setattr(_CONNECTION, "func", _connect)
 
 
 @pytest.fixture
 def outputs(tmp_path: Path, mlflow_tables: Callable[[Path], None]) -> Path:
-    """An outputs folder whose database has MLflow's tables, for commands in processes of their own."""
+    """Return an outputs folder whose database has MLflow's tables, for commands in other processes."""
     mlflow_tables(tmp_path / "outputs")
     return tmp_path / "outputs"
 
@@ -171,7 +171,7 @@ def outputs(tmp_path: Path, mlflow_tables: Callable[[Path], None]) -> Path:
 def mlflow_server(
     answering: Callable[..., None], mlflow_tables: Callable[[Path], None]
 ) -> Callable[[Path, int], Serving]:
-    """A server on the store in a folder, which ends by SIGKILL."""
+    """Return a context manager of a server on a folder's store, which ends by SIGKILL."""
 
     @contextmanager
     def serving(folder: Path, port: int) -> Iterator[None]:
@@ -203,7 +203,7 @@ def _composed(*overrides: str) -> DictConfig:
 
 @pytest.fixture
 def tiny(tmp_path: Path) -> Callable[..., Config]:
-    """Composes a config of a training of seconds: `tiny("model=resnet", "seed=1")`."""
+    """Return a function that composes a training of seconds: `tiny("model=resnet", "seed=1")`."""
 
     def composed(*overrides: str) -> Config:
         seeds = [override for override in overrides if re.fullmatch(r"seed=\d+", override)]
@@ -219,13 +219,13 @@ def tiny(tmp_path: Path) -> Callable[..., Config]:
 
 @pytest.fixture(scope="session")
 def tiny_overrides() -> tuple[str, ...]:
-    """What `tiny` composes with, for a process of its own."""
+    """Return the overrides of `tiny`, for another process."""
     return TINY
 
 
 @pytest.fixture
 def started() -> Iterator[Callable[[Config, Path], Trainer]]:
-    """Builds a trainer in a folder and continues from the checkpoint there, as the command does."""
+    """Return a function that builds a trainer and continues from a folder's checkpoint, as the command does."""
     trainers = []
 
     def trainer_of(config: Config, folder: Path) -> Trainer:
@@ -243,9 +243,9 @@ def started() -> Iterator[Callable[[Config, Path], Trainer]]:
 
 @pytest.fixture
 def recorded(tiny: Callable[..., Config]) -> Callable[..., Path]:
-    """Writes the folder of a finished training without training it.
+    """Return a function that writes the folder of a finished training without training it.
 
-    scores are its evaluation's; curve holds (frames, hours, updates, mean score) a point.
+    scores are its evaluation's; curve has (frames, hours, updates, mean score) a point.
     """
 
     def record(
@@ -287,7 +287,7 @@ def recorded(tiny: Callable[..., Config]) -> Callable[..., Path]:
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    """Runs a command line in this process and returns its exit code: `command("evaluate", "run=latest")`."""
+    """Return a function that runs a command line and returns its exit code: `command("evaluate", "run=latest")`."""
 
     def run(*words: str) -> int:
         monkeypatch.setattr(sys, "argv", ["atlantis_exp", *words])

@@ -1,8 +1,8 @@
-"""Which small faults the quick tests notice: `python tests/mutants.py [MODULE ...] [--sample N] [--seed N]`.
+"""Find small faults that the quick tests miss: `python tests/mutants.py [MODULE ...] [--sample N] [--seed N]`.
 
-A mutant is a module with one operator, constant, condition or order of arguments changed, or one statement removed. A
-process of its own runs the quick tests that call the changed function, of the module's test file and those in `ALSO`.
-The mutants in `tests/equivalent_mutants.txt` do what the original does and are left out.
+A mutant is a module with one operator, constant, condition or order of arguments changed, or one statement removed. For
+each, a new process runs the quick tests that call the changed function, from the module's test file and those in
+`ALSO`. The mutants in `tests/equivalent_mutants.txt` are equivalent to the original and left out.
 """
 
 import argparse
@@ -65,12 +65,12 @@ OPERATORS: dict[type[ast.AST], tuple[type[ast.AST], ...]] = {
 }
 REMOVED = (ast.AugAssign, ast.Break, ast.Continue, ast.Delete, ast.For, ast.If, ast.Raise, ast.While)
 SYMMETRIC = ("array_equal", "max", "maximum", "min", "minimum", "swapaxes")
-UNREAD = {"annotation", "returns", "decorator_list", "bases"}  # no behaviour, or the module's own
+UNREAD = {"annotation", "returns", "decorator_list", "bases"}  # without behaviour, or run at import
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """A node of a module's tree and what takes its place; `first` and `last` are the lines of its function."""
+    """A node of a module's tree and its replacement; `first` and `last` are the lines of its function."""
 
     place: tuple[ast.AST, str, int | None]
     node: ast.AST
@@ -143,7 +143,7 @@ def mutants_of(tree: ast.AST, function: ast.AST | None = None) -> Iterator[Mutan
 
 
 class Watch:
-    """Notes how long each test takes, and the functions of a file that it calls, by their first lines."""
+    """Record each test's time and the functions of a file that it calls, by their first lines."""
 
     def __init__(self, file: Path) -> None:
         self.file = str(file)
@@ -168,28 +168,28 @@ class Watch:
 
 
 def ask(tests: Sequence[str], folder: Path, *options: str, plugin: object = None) -> int:
-    """Run tests in this process, which must not have run any; pytest's exit code."""
+    """Run tests in this process, which must not have run any; return pytest's exit code."""
     from hypothesis import Phase, settings
 
     settings.register_profile("once", database=None, phases=[Phase.explicit, Phase.generate])
-    settings.load_profile("once")  # which the profile of the tests inherits from
+    settings.load_profile("once")  # the tests' profile inherits from it
     words = ["-x", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0", f"--basetemp={folder}", *options, *tests]
     return int(pytest.main(words, plugins=[plugin] if plugin else []))
 
 
 def apart(log: Path) -> int:
-    """Fork; in the child, which leads a group of its own, what it prints goes to a file."""
+    """Fork; send the output of the child, which leads its own group, to a file."""
     if (child := os.fork()) == 0:
         os.setsid()
         out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(out, 1)
         os.dup2(out, 2)
-        resource.setrlimit(resource.RLIMIT_AS, (16 << 30, 16 << 30))  # a loop may collect without end
+        resource.setrlimit(resource.RLIMIT_AS, (16 << 30, 16 << 30))  # a mutant may loop and allocate forever
     return child
 
 
 def observed(file: Path, tests: Sequence[str], folder: Path) -> Watch:
-    """Return what the quick tests do without a mutant; import what they import, so that the forks need not."""
+    """Watch the quick tests without a mutant; import their modules, so that the forks need not."""
     notes = folder / "notes.json"
     if (child := apart(folder / "log")) == 0:
         watch = Watch(file)
@@ -222,7 +222,7 @@ def run_mutated(module: str, tree: ast.Module, mutant: Mutant | None, tests: Seq
 
 
 def killed_of(module: str, sample: int, seed: int, folder: Path) -> dict[str, Any]:
-    """Run a sample of a module's mutants, and print each with its fate."""
+    """Run a sample of a module's mutants and print the fate of each."""
     path = ROOT / "atlantis_exp" / f"{module.replace('.', '/')}.py"
     names = [name.rpartition(".") for name in (module, *ALSO.get(module, ()))]
     files = [str(Path("tests", *package.split("."), f"test_{name}.py")) for package, _, name in names]
@@ -234,7 +234,7 @@ def killed_of(module: str, sample: int, seed: int, folder: Path) -> dict[str, An
     chosen = random.Random(seed).sample(mutants, min(sample, len(mutants)))
     by_cost = sorted(watch.seconds, key=watch.seconds.__getitem__)
     latest_first = sorted(chosen, key=lambda each: -each.line)
-    waiting: list[Mutant | None] = [*latest_first, None]  # first of all the original
+    waiting: list[Mutant | None] = [*latest_first, None]  # the original first
     running: dict[int, tuple[Mutant | None, float, Path]] = {}
     survivors: list[str] = []
     while waiting or running:

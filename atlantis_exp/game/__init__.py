@@ -1,6 +1,6 @@
-"""A game of ALE, played.
+"""Play a game of ALE.
 
-In: seeds and actions. Out: observations, the game's own rewards, the ends of episodes. A saved game goes on exactly, in
-any number of worker processes. `atlantis.py` alone knows which game it is; other modules are handed its facts. It must
-not know how an observation is used: no replay, no network, no learner, no config.
+In: seeds and actions. Out: observations, the game's own rewards, the ends of episodes. A saved game continues exactly,
+in any number of worker processes. Only `atlantis.py` knows which game it is; other modules receive its facts. The
+package must not know how observations are used: no replay, network, learner or config.
 """

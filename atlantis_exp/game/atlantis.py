@@ -1,19 +1,19 @@
-"""Atlantis: all that the package knows of this game, with the files `atlantis_*` next to it.
+"""The facts of Atlantis, with the files `atlantis_*` next to this one.
 
-Three guns defend a city. A life, as ALE counts it, is a building that stands, guns included; it can rise again. A gun
-fires once a press, so that an action that is held fires once.
+Three guns defend a city. ALE counts each standing building, guns included, as a life; it can rise again. A gun fires
+once a press, so a held action fires once.
 """
 
 from collections.abc import Sequence
 
-_WAVE_STATE, _WAVE_OVER = 0x53, 2  # a byte of the console's memory; so from the frame of the bonus to the next wave
+_WAVE_STATE, _WAVE_OVER = 0x53, 2  # a byte of the console's memory, and its value from the bonus to the next wave
 
 
 class Atlantis:
-    """The game that this package is about.
+    """This package's game.
 
-    A vessel pays 100 and a bomber 1,000 where the centre gun hits it, twice as much where a side gun does; the end of a
-    wave pays 500 for each building that stands, in one frame.
+    The centre gun scores 100 for a vessel and 1,000 for a bomber, a side gun twice as much. The end of a wave scores
+    500 for each standing building, in one frame.
     """
 
     actions = ("NOOP", "FIRE", "RIGHTFIRE", "LEFTFIRE")  # FIRE is the gun in the middle
@@ -21,8 +21,8 @@ class Atlantis:
     episode_steps = 2_000  # in `Atlantis-v0`; a good player plays many times longer
     sources = ("centre_vessel", "side_vessel", "centre_bomber", "side_bomber", "wave_bonus")
     sources_in_words = (
-        "vessels and bombers, each hit by the centre gun or a side gun, and the bonus for the buildings that stand at "
-        "a wave's end"
+        "vessels and bombers, each hit by the centre gun or a side gun, and the bonus for standing buildings at the "
+        "end of a wave"
     )
     random_score = 12_850.0
     human_score = 29_028.1
@@ -38,5 +38,5 @@ class Atlantis:
         """Split a frame's reward by `sources`; `ram` is the console's, 128 bytes, after the frame."""
         if ram[_WAVE_STATE] == _WAVE_OVER:
             return 0, 0, 0, 0, reward
-        bombers, vessels = divmod(reward // 100, 10)  # of several hits in one frame the centre gun has one at most
+        bombers, vessels = divmod(reward // 100, 10)  # the centre gun hits at most once a frame
         return vessels % 2 * 100, vessels // 2 * 200, bombers % 2 * 1_000, bombers // 2 * 2_000, 0

@@ -1,4 +1,4 @@
-"""One game on ALE: equal to Gymnasium's for the same seed and actions, saved and restored exactly."""
+"""Play one game on ALE, as Gymnasium plays it for the same seed and actions; save and restore it exactly."""
 
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -22,13 +22,13 @@ class Step(NamedTuple):
     reward: float  # the game's own, never clipped
     terminated: bool
     truncated: bool
-    life_lost: bool  # fewer are left than before
+    life_lost: bool
     frames: int  # emulated in this step
-    points: list[float]  # the reward by its source, in the order of the game's sources
+    points: list[float]  # the reward by source, in the order of the game's sources
 
 
 def check_game(game: Game) -> None:
-    """Raise ConfigError if ALE lacks the ROM, or has another screen or other actions for it."""
+    """Raise ConfigError if ALE lacks the game's ROM, or has another screen or other actions for it."""
     if game.rom not in get_all_rom_ids():
         raise ConfigError(f"{game.rom}: ALE has no ROM of that name")
     ale = ALEInterface()
@@ -40,16 +40,16 @@ def check_game(game: Game) -> None:
 
 
 class Emulator:
-    """One game, from frames to observations; before its first seed it plays as if seeded with 0.
+    """One game, from frames to observations; until it gets a seed it uses 0.
 
-    game: its ROM, its actions (an action is an index of them), and the sources of its points.
+    game: its ROM, its actions (an action is an index into them), and the sources of its points.
     frameskip: frames in a step, or (low, high): drawn from low to high - 1 in every step, as in the report.
-    sticky: probability that a frame repeats the action of the one before (Machado et al., 2018).
+    sticky: probability that a frame repeats the previous frame's action (Machado et al., 2018).
     max_frames: frames after which an episode is truncated.
     max_steps: steps after which an episode is truncated (27,000 in report figure 1.3), or None.
     noop_max: an episode begins with 1 to `noop_max` frames of NOOP; 0 for none.
-    max_pool: a pixel is the brighter of a step's last two frames (Mnih et al., 2015), and a step stops where the
-        episode ends, both as in Gymnasium's `AtariPreprocessing`. Raises ValueError if a step may be one frame.
+    max_pool: take each pixel's maximum over a step's last two frames (Mnih et al., 2015), and end a step with its
+        episode, as Gymnasium's `AtariPreprocessing` does. Raises ValueError if a step may be one frame.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Emulator:
 
     @property
     def lives(self) -> int:
-        """Lives as ALE counts them; in some games they can rise again."""
+        """Lives as ALE counts them; in some games the count can rise."""
         return self._ale.lives()
 
     def screen_rgb(self) -> Pixels:
@@ -90,7 +90,7 @@ class Emulator:
         return PALETTE.take(self._screen, axis=0)
 
     def reset(self, seed: int | None = None) -> Pixels:
-        """Begin an episode and return its first observation; without a seed the random streams go on."""
+        """Begin an episode and return its first observation; without a seed the random streams continue."""
         if seed is not None or not self._is_loaded:
             self._load_game(seed or 0)
         self._keep_origin()
@@ -106,7 +106,7 @@ class Emulator:
         return self.preprocessing.resize(self._pool)
 
     def step(self, action: int) -> Step:
-        """Play an action for one frameskip; an episode that could be both terminated and truncated is terminated."""
+        """Play an action for one frameskip; termination takes precedence over truncation."""
         self._played.append(action)
         frameskip = self._frameskip
         if not isinstance(frameskip, int):
@@ -135,9 +135,9 @@ class Emulator:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return how the episode began and its actions.
+        """Return the state before the episode and the episode's actions.
 
-        ALE's own state is not exact in another emulator: its TIA forgets where the graphics registers point.
+        ALE's own state is not exact in another emulator: its TIA loses the positions of the graphics registers.
         """
         return {
             "ale": self._origin,
@@ -147,9 +147,9 @@ class Emulator:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Play the episode again up to where it was: a second for some 4,000 steps. Raises: ValueError, IndexError."""
+        """Replay the episode so far, some 4,000 steps a second. Raises: ValueError, IndexError."""
         if len(state["actions"]) > self._ale.getInt("max_num_frames_per_episode"):
-            raise ValueError("its episode is longer than an episode can be")
+            raise ValueError("its episode has more actions than frames allowed")
         if not self._is_loaded:
             self._load_game(0)
         try:
@@ -164,7 +164,7 @@ class Emulator:
             self.step(action)
 
     def _load_game(self, seed: int) -> None:
-        """Start both random streams, as ale_py.env.AtariEnv.seed_game does; ALE takes a seed only with a game."""
+        """Seed both random streams, as ale_py.env.AtariEnv.seed_game does; ALE takes a seed only with a game."""
         own_seed, ale_seed = np.random.SeedSequence(seed).generate_state(2)
         self._generator = np.random.default_rng(own_seed)
         self._ale.setInt("random_seed", ale_seed.astype(np.int32))
@@ -188,7 +188,7 @@ class Emulator:
         return reward
 
     def _act_and_pool(self, action: int, frameskip: int) -> int:
-        """Return the reward; a step cut short pools with the step before, as in `AtariPreprocessing`."""
+        """Return the reward; an interrupted step pools with the previous one, as in `AtariPreprocessing`."""
         reward = 0
         before_last = last = self._pool
         for left in reversed(range(frameskip)):

@@ -34,10 +34,10 @@ GREY = cast(Pixels, cv2.cvtColor(PALETTE[np.newaxis], cv2.COLOR_RGB2GRAY)[0])
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """Turns a screen of palette indices, (210, 160) uint8, into an observation, (size, size) uint8.
+    """Turn a screen of palette indices, (210, 160) uint8, into an observation, (size, size) uint8.
 
     Grey, crop, area interpolation: within one grey level of 255 times the float of report figure 2.3. `crop` is its
-    `exclude`, (UP, RIGHT, DOWN, LEFT) in pixels: rows UP to DOWN - 1 and columns LEFT to RIGHT - 1 stay. Raises
+    `exclude`, (UP, RIGHT, DOWN, LEFT) in pixels, and keeps rows UP to DOWN - 1 and columns LEFT to RIGHT - 1. Raises
     ValueError if it leaves the screen.
     """
 
@@ -63,10 +63,10 @@ class Preprocessing:
 
 
 class FrameStack:
-    """The newest `stack` observations of each environment, oldest first; an episode's first fills the places before it.
+    """The newest `stack` observations of each environment, oldest first; an episode's first one fills missing places.
 
-    `state` is (num_envs, stack, size, size) uint8. A change makes a new array, so a state handed out stays as it was:
-    `stack_frame` of report figure 2.3 shifts in place, and every next state is its state.
+    `state` is (num_envs, stack, size, size) uint8. Every change makes a new array, so earlier states never change:
+    `stack_frame` of report figure 2.3 shifts in place, which makes every next state equal to its state.
     """
 
     def __init__(self, num_envs: int, size: int, stack: int = 4) -> None:

@@ -1,4 +1,4 @@
-"""Many emulators, here or in worker processes; neither their number nor timing changes a result."""
+"""Run many emulators, here or in worker processes; neither the number of workers nor timing changes a result."""
 
 import atexit
 import multiprocessing
@@ -28,13 +28,13 @@ from atlantis_exp.games import Game
 Rows = npt.NDArray[np.void]  # the last Step of each environment
 Calls = dict[int, tuple[Any, ...]]  # environment to the arguments of a call of its emulator
 
-_LAST_SECONDS = 5  # of patience, once the training is asked to stop
+_LAST_SECONDS = 5  # of patience after a request to stop
 
 _FOR_THE_PARENT = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 
 
 class WorkerDied(RunFault):
-    """A worker process has ended or hangs; the message names it, its environments and the cause."""
+    """A worker process has died or hangs; the message names it, its environments and the cause."""
 
 
 class Steps(NamedTuple):
@@ -52,15 +52,15 @@ class Steps(NamedTuple):
 class Emulators(ABC):
     """Emulators of environments 0 to num_envs - 1, all of one game; none begins an episode by itself.
 
-    `envs` are distinct, by default all. Several steps can be under way, of different environments each; a call of one
-    whose step was not received yet raises RuntimeError. `stop` is asked while a worker hangs.
+    `envs` are distinct, by default all. Several steps can be under way if their environments differ; a call to an
+    environment whose step was not received yet raises RuntimeError. `stop` shortens the wait for a hanging worker.
     """
 
     def __init__(self, num_envs: int, game: Game, rows: Rows) -> None:
         self.num_envs, self.game = num_envs, game
         self.stop: Callable[[], bool] = lambda: False
         self._rows = rows
-        self._sent: deque[Envs] = deque()  # the environments of each step that was not received yet
+        self._sent: deque[Envs] = deque()  # the environments of each step not received yet
         self._unheard = 0  # the latest of these that were not waited for
 
     def reset(self, envs: Envs, seeds: Sequence[int | None] | None = None) -> Pixels:
@@ -79,7 +79,7 @@ class Emulators(ABC):
         self._unheard += 1
 
     def receive(self) -> Steps:
-        """Wait for the oldest step that was sent and return it."""
+        """Wait for the oldest step sent and return it."""
         if not self._sent:
             raise RuntimeError("no step was sent")
         self._wait(unheard=len(self._sent) - 1)
@@ -115,7 +115,7 @@ class Emulators(ABC):
 
     @abstractmethod
     def _results(self) -> dict[int, Any]:
-        """Wait for the oldest call and return its results by environment, but for those in the rows."""
+        """Wait for the oldest call and return its results by environment, except those in the rows."""
 
     def _call(self, method: str, calls: Calls) -> dict[int, Any]:
         self._refuse_sent(calls)
@@ -158,11 +158,11 @@ class SerialEmulators(Emulators):
 class ProcessEmulators(Emulators):
     """Emulators in worker processes, which play between `send` and `receive`.
 
-    Steps come through nameless shared memory, all else through pipes. Workers ignore signals and end with this process.
-    Waiting for one that has ended or hangs ends the others and raises WorkerDied.
+    Steps come through anonymous shared memory, all else through pipes. Workers ignore signals and end with this
+    process. If one dies or hangs, the wait for it ends the others and raises WorkerDied.
     """
 
-    patience = 60.0  # seconds that a worker may neither answer nor use the processor
+    patience = 60.0  # seconds without an answer or processor time
 
     def __init__(self, make: Callable[[], Emulator], num_envs: int, workers: int) -> None:
         row = _row(first := make())  # errors of `make` are raised here
@@ -192,7 +192,7 @@ class ProcessEmulators(Emulators):
         for connection, process in zip(self._connections, self._processes, strict=True):
             connection.close()
             process.kill()
-            process.join(_LAST_SECONDS)  # longer where the kernel holds it, as for a lost disk
+            process.join(_LAST_SECONDS)  # the kernel may hold it longer, as for a lost disk
 
     def _start(self, method: str, calls: Calls) -> None:
         for envs, connection in zip(self._envs, self._connections, strict=True):
@@ -215,7 +215,7 @@ class ProcessEmulators(Emulators):
     def _wait_for(self, worker: int) -> str:
         """Wait for a worker's answer; return the reason to give up, empty if it has answered or died.
 
-        Seconds are counted by polls, so that they stop while this process is suspended.
+        Polls count the seconds, so the count stops while this process is suspended.
         """
         idle, used = 0, -1.0
         while not self._polls[worker].poll(1_000):  # ms
@@ -230,9 +230,9 @@ class ProcessEmulators(Emulators):
 
 
 def make_emulators(make: Callable[[], Emulator], num_envs: int, workers: int) -> Emulators:
-    """Return `num_envs` emulators that `make`, a picklable call, builds in `workers` processes.
+    """Return `num_envs` emulators that `make`, a picklable callable, builds in `workers` processes.
 
-    A single environment stays in this process, as do all without workers.
+    A single environment, or all if there are no workers, stay in this process.
     """
     if num_envs == 1 or workers == 0:
         return SerialEmulators(make, num_envs)
@@ -241,7 +241,7 @@ def make_emulators(make: Callable[[], Emulator], num_envs: int, workers: int) ->
 
 @contextmanager
 def _signals_held() -> Iterator[None]:
-    """Hold back the parent's signals until the block ends and its new processes ignore them."""
+    """Block the parent's signals until its new processes ignore them."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _FOR_THE_PARENT)
     try:
         resource_tracker.ensure_running()  # the first process would start it, and it unblocks some signals
@@ -272,9 +272,9 @@ def _play(emulators: dict[int, Emulator], rows: Rows, method: str, calls: Calls)
 
 
 def _cores_for(workers: int) -> list[int]:
-    """Return the core of each worker: woken together, they would all begin on one.
+    """Return a core for each worker, since workers that wake together would all start on one.
 
-    Return an empty list (any core) if there are fewer workers than cores: parallel runs would share the same few.
+    With fewer workers than cores return an empty list (any core): parallel runs would share the same few.
     """
     if not hasattr(os, "sched_getaffinity"):  # no Linux
         return []

@@ -1,5 +1,5 @@
-"""Learning: from batches of transitions to better action values.
+"""Learn action values from batches of transitions.
 
 In: networks, an optimizer, numpy batches of transitions. Out: action values, means of measurements, state dicts.
-It must not know where transitions come from, which network it trains, or who watches.
+The package must not know where transitions come from, which network it trains, or who watches.
 """

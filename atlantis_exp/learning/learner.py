@@ -1,4 +1,4 @@
-"""The learner: two networks, an optimizer, and the update that moves them."""
+"""Update two networks with an optimizer."""
 
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,32 +16,31 @@ from atlantis_exp.learning.objectives import Objective, td_errors
 from atlantis_exp.learning.values import ActionValues, Replicas, generators_of
 
 _MEASURES = ("loss", "q", "target", "gradient_norm")
-_AVERAGE_EVERY = 10  # updates, since an average of weights moves as much memory as the optimizer does
+_AVERAGE_EVERY = 10  # updates, since averaging weights moves as much memory as the optimizer does
 
 
 class Learner(ActionValues):
-    """Learns action values by gradient steps on `network`, which `target` follows by a share `tau` (report figure 2.5).
+    """Learn action values by gradient steps on `network`, which `target` follows by a share `tau` (report figure 2.5).
 
     `target` moves after every `target_every` updates: with tau below 1 it follows softly, with tau 1 it is a copy.
-    Both networks lie on one device; weights are float32. With precision "bf16" the forward and backward passes run in
+    Both networks are on one device; weights are float32. With precision "bf16" the forward and backward passes run in
     bfloat16, the loss, the optimizer and the soft update in float32.
 
-    With several shards a batch is cut into parts, each computed by one thread from the states to the gradients. Threads
-    then wait for each other once an update instead of after every operation: as fast on a quiet machine, several times
-    faster on a busy one (docs/performance.md). Raises ValueError unless the network's class says `splits_batches`: no
-    batch norm, no shared dropout generator.
+    With several shards, one thread computes each part of a batch from the states to the gradients. Threads then wait
+    for each other once an update instead of after every operation: as fast on a quiet machine, several times faster on
+    a busy one (docs/performance.md). Raises ValueError unless the network's class sets `splits_batches`: no batch norm,
+    no shared dropout generator.
 
-    The network is in train mode for its pass over s_t alone, the target network never: its running statistics follow
-    the network's as its parameters do. The report leaves it in train mode (dropout and batch statistics in its targets)
-    and moves its parameters alone: target_mode "train".
+    The network is in train mode only for its pass over s_t, the target network never: its running statistics follow the
+    network's as its parameters do. The report leaves it in train mode (dropout and batch statistics in its targets) and
+    moves only its parameters: target_mode "train".
 
     `evaluated` is the network to evaluate: the online one or, with `ema`, an exponential moving average of its weights
     over about as many updates, which does not influence learning.
 
-    Statistics gather on the device: `update` never waits for it, and a GPU is sent batches from pinned memory.
+    Statistics accumulate on the device, so `update` never waits for it. Batches reach a GPU from pinned memory.
 
-    compile: makes faster modules of both networks for updates, as torch.compile does; the batches of acting differ in
-    size.
+    compile: compiles both networks for updates, as torch.compile does, but not for acting, whose batches vary in size.
     """
 
     def __init__(
@@ -75,13 +74,13 @@ class Learner(ActionValues):
         )
         self.target_mode = target_mode
         self.updates = 0
-        self._has_begun_with = False  # given weights, which the average holds, too
+        self._has_begun_with = False  # given weights, which the average has, too
         self._sums = torch.zeros(len(_MEASURES), device=self.device)
         self._measured = 0  # updates in the sums
         self._first_nonfinite = torch.full((), -1, device=self.device)
 
     def begin_with(self, weights: Mapping[str, torch.Tensor]) -> None:
-        """Take over a network's weights before the first update, in all networks. Raises: RuntimeError."""
+        """Load weights into all networks before the first update. Raises: RuntimeError."""
         for network in (self.network, self.target, self.evaluated):
             network.load_state_dict(weights)
         for replicas in (self._online, self._target, self._evaluated):
@@ -97,9 +96,9 @@ class Learner(ActionValues):
         discount: npt.NDArray[np.floating],
         weights: npt.NDArray[np.floating] | None = None,
     ) -> torch.Tensor:
-        """Take one optimizer step on a batch of transitions, then update target and average when due.
+        """Take one optimizer step on a batch of transitions, then update target and average if due.
 
-        States (B, C, H, W) in 0..255; actions, rewards and discounts (B,), as `Objective` wants them; weights (B,) of
+        States (B, C, H, W) in 0..255; actions, rewards and discounts (B,), as `Objective` needs them; weights (B,) of
         the samples in the loss. Returns absolute TD errors (B,), on the device.
         """
         if weights is None:
@@ -124,7 +123,7 @@ class Learner(ActionValues):
 
     def _move_average(self) -> None:
         if self.ema and self.updates % _AVERAGE_EVERY == 0:
-            # From random weights, a plain mean of all so far until there are `ema` of them.
+            # After random weights take the plain mean until it has `ema` of them.
             first = 0.0 if self._has_begun_with else _AVERAGE_EVERY / self.updates
             share = max(first, _AVERAGE_EVERY / self.ema)
             _follow(self.evaluated, self.network, share, buffers=True)
@@ -166,7 +165,7 @@ class Learner(ActionValues):
         return gradients, means, td_errors(q, actions, target)
 
     def evaluated_q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
-        """Return the values (B, A) of `evaluated` of states (B, C, H, W) in 0..255; changes nothing."""
+        """Return the values (B, A) that `evaluated` gives states (B, C, H, W) in 0..255; change nothing."""
         return self.all_values(self._evaluated, states)
 
     @property
@@ -188,7 +187,7 @@ class Learner(ActionValues):
         self.load_state_dict(state)
 
     def update_flops(self, state: tuple[int, int, int], batch_size: int) -> int:
-        """Return the floating-point operations of one update on batches of states (C, H, W); changes nothing.
+        """Return the floating-point operations of one update on batches of states (C, H, W); change nothing.
 
         Counts convolutions and matrix products in all passes, a multiply-add as two.
         """
@@ -202,9 +201,9 @@ class Learner(ActionValues):
         return int(counter.get_total_flops() * batch_size // 2)
 
     def statistics(self) -> dict[str, float]:
-        """Return the means over the updates since the last call, empty if there was none; waits for the device.
+        """Return the means over the updates since the last call, empty without updates; wait for the device.
 
-        Loss and the norm of its gradient; q, the values of all actions at s_t; target, the values they are drawn to.
+        Loss and the norm of its gradient; q, the values of all actions at s_t; target, their targets.
         """
         if self._measured == 0:
             return {}
@@ -214,7 +213,7 @@ class Learner(ActionValues):
         return dict(zip(_MEASURES, means, strict=True))
 
     def first_nonfinite_update(self) -> int | None:
-        """Return the index of the first update whose loss was not finite, or None; waits for the device."""
+        """Return the index of the first update whose loss was not finite, or None; wait for the device."""
         index = int(self._first_nonfinite)
         return None if index < 0 else index
 
@@ -262,7 +261,7 @@ class Learner(ActionValues):
         self._target.refresh()
 
     def _check_optimizer(self) -> None:
-        """Compare the shapes of the loaded state with those after a step; torch does not. Raises: ValueError."""
+        """Compare the shapes of the loaded state with those after a step, as torch does not. Raises: ValueError."""
 
         def form(optimizer: torch.optim.Optimizer) -> dict[tuple[int, str], object]:
             return {
@@ -303,13 +302,13 @@ def _summed(gradients: Sequence[list[torch.Tensor]]) -> list[torch.Tensor]:
 
 
 def _learned(network: nn.Module) -> list[nn.Parameter]:
-    """Return the parameters that are not frozen."""
+    """Return the parameters that learn."""
     return [parameter for parameter in network.parameters() if parameter.requires_grad]
 
 
 @torch.no_grad()
 def _follow(follower: nn.Module, leader: nn.Module, share: float, *, buffers: bool) -> None:
-    """Move a network's parameters towards another's by a share of the way, and its buffers where asked."""
+    """Move a network's parameters, and optionally buffers, towards another's by a share of the way."""
     torch._foreach_lerp_(list(follower.parameters()), list(leader.parameters()), share)
     if buffers:
         for running, latest in zip(follower.buffers(), leader.buffers(), strict=True):

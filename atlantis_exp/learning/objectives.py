@@ -1,4 +1,4 @@
-"""Objectives: the targets of an update, and the loss."""
+"""Compute the targets and the loss of an update."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,15 +10,15 @@ from torch.nn.functional import smooth_l1_loss
 from atlantis_exp.components import Quantiles, Rescaling
 
 QFunction: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
-"""States (B, C, H, W) in [0, 1] to float32 values (B, A), or to N quantiles of each (B, A, N), without gradient and in
-the mode the learner chose."""
+"""Maps states (B, C, H, W) in [0, 1] to float32 values (B, A), or to N quantiles of each (B, A, N), without gradient,
+in the learner's choice of mode."""
 
 
 class Objective(Protocol):
-    """Targets computed without gradient, then a loss per sample that the learner averages over the batch.
+    """Compute targets without gradient, then a loss per sample, which the learner averages over the batch.
 
-    A sample's reward and discount (B,) are those of the m steps from s_t to s_tpm. Discount 0 cuts the bootstrap, as
-    where the episode has terminated; a truncated episode's last transition has its discount.
+    A sample's reward and discount (B,) cover the m steps from s_t to s_tpm. Discount 0 cuts the bootstrap, as after a
+    terminated episode; the last transition of a truncated episode keeps its discount.
     """
 
     def targets(
@@ -28,12 +28,12 @@ class Objective(Protocol):
         ...
 
     def losses(self, q: torch.Tensor, a_t: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """Return the loss of each sample, (B,), from values or quantiles q at s_t and what `targets` returned."""
+        """Return the loss of each sample, (B,), from values or quantiles q at s_t and the result of `targets`."""
         ...
 
 
 def action_values(q: torch.Tensor) -> torch.Tensor:
-    """Return the values (B, A) of values (B, A) or of quantiles (B, A, N), whose mean they are."""
+    """Return values (B, A) unchanged, or the mean of quantiles (B, A, N)."""
     return q if q.ndim == 2 else q.mean(2)
 
 
@@ -58,8 +58,8 @@ class DQN:
 class DoubleDQN(DQN):
     """The online network chooses the next action, the target network values it (van Hasselt et al. 2016, equation 4).
 
-    The online network chooses in eval mode, as it does when it acts: without dropout and with running statistics,
-    which s_tpm therefore leaves alone.
+    The online network chooses in eval mode, as when it acts: without dropout and with running statistics, which s_tpm
+    does not change.
     """
 
     def _next_values(self, s_tpm: torch.Tensor, online: QFunction, target: QFunction) -> torch.Tensor:
@@ -94,8 +94,7 @@ class DoubleQuantile(Quantile, DoubleDQN):
 
 @dataclass(frozen=True)
 class _Rescaled(DQN):
-    """Learns h(return), which makes large returns small; h is undone before rewards are added (Pohlen et al. 2018,
-    equation 5)."""
+    """Learn h(return), which shrinks large returns; undo h to add rewards (Pohlen et al. 2018, equation 5)."""
 
     rescaling: Rescaling
 
@@ -113,9 +112,9 @@ class RescaledDoubleDQN(_Rescaled, DoubleDQN):
 
 @dataclass(frozen=True)
 class RescaledQuantile(_Rescaled, Quantile):
-    """QR-DQN on rescaled returns, whose quantiles are those of the returns, rescaled.
+    """QR-DQN on rescaled returns; its quantiles are the rescaled quantiles of the returns.
 
-    Actions are chosen by the mean of the rescaled quantiles, which is below the rescaled mean if returns vary.
+    The mean of the rescaled quantiles, which chooses actions, is below the rescaled mean if returns vary.
     """
 
 
@@ -148,18 +147,17 @@ RESCALINGS = {"signed_sqrt": (signed_sqrt, undo_signed_sqrt), "symlog": (symlog,
 
 
 def td_errors(q: torch.Tensor, a_t: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Return how far each sample's value, or its quantiles' mean, is off its target, (B,)."""
+    """Return the absolute error of each sample's value, or of its quantiles' mean, (B,)."""
     error = target - taken(q, a_t)
     return (error if error.ndim == 1 else error.mean(1)).abs()
 
 
 def taken(q: torch.Tensor, a_t: torch.Tensor) -> torch.Tensor:
-    """Return the part of q, (B, A) or (B, A, N), of one action of each sample."""
+    """Return the entries of q, (B, A) or (B, A, N), for one action of each sample."""
     return q[torch.arange(len(a_t), device=q.device), a_t]
 
 
 def bootstrapped(r_t: torch.Tensor, discount: torch.Tensor, v_tpm: torch.Tensor) -> torch.Tensor:
-    """Return rewards plus discounted values (B,) or quantiles (B, N); rewards alone if the discount is 0, even for
-    infinite values."""
+    """Return rewards plus discounted values (B,) or quantiles (B, N); discount 0 cancels even infinite values."""
     r_t, discount = (each.view(-1, *(1 for _ in v_tpm.shape[1:])) for each in (r_t, discount))
     return torch.where(discount == 0, r_t, r_t + discount * v_tpm)

@@ -1,4 +1,4 @@
-"""Epsilon, or the learning rate's factor, as a function of progress: 0 at a training's start, 1 at its planned end."""
+"""Schedule epsilon, or the learning rate's factor, by progress: 0 at a training's start, 1 at its planned end."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from atlantis_exp.components import Count, Positive, Probability, Share
 
 
 class Schedule(Protocol):
-    """A value at every progress >= 0, after so many steps; progress exceeds 1 past the last planned episode."""
+    """Return the value at a progress >= 0 and a number of steps; progress exceeds 1 past the last planned episode."""
 
     def __call__(self, progress: float, steps: int) -> float: ...
 
@@ -50,9 +50,9 @@ class LinearSteps:
 
 @dataclass(frozen=True)
 class Exponential:
-    """A value whose distance to `end` shrinks by a factor e per `decay` and never quite vanishes (report figure 4.1).
+    """A value whose distance to `end` shrinks by a factor e per `decay` but never vanishes (report figure 4.1).
 
-    The report decays from 0.9 to 0.02 by episode with half its number of episodes as constant: `decay` 0.5.
+    The report decays from 0.9 to 0.02 by episode, with half its number of episodes as the constant: `decay` 0.5.
     """
 
     start: Probability

@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 def generators_of(network: nn.Module) -> Iterator[tuple[str, torch.Generator]]:
-    """Yield the attribute `generator` of each module of a network that has one."""
+    """Yield the name and the `generator` of each module of a network that has one."""
     for name, module in network.named_modules():
         if isinstance(generator := getattr(module, "generator", None), torch.Generator):
             yield name, generator
@@ -61,21 +61,21 @@ class Replicas:
 
 
 class ActionValues:
-    """The action values of a network in eval mode, on its device; precision, shards and errors as of `Learner`."""
+    """Compute a network's action values in eval mode, on its device; precision, shards and errors as for `Learner`."""
 
     def __init__(self, network: nn.Module, *, precision: Literal["fp32", "bf16"] = "fp32", shards: int = 1) -> None:
         self.network = network.eval()
         self.dtype = torch.bfloat16 if precision == "bf16" else torch.float32
         self.device = next(network.parameters()).device
         if shards > 1 and not getattr(network, "splits_batches", False):
-            raise ValueError("the network does not say splits_batches, so a batch is not split into shards")
+            raise ValueError("a network without splits_batches cannot split a batch into shards")
         self.shards = shards
         if shards > 1:
             self._threads = ThreadPoolExecutor(shards, "learner", partial(torch.set_num_threads, 1))
         self._online = Replicas(network, self.dtype, shards)
 
     def q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
-        """Return the network's values (B, A) of states (B, C, H, W) in 0..255; changes nothing."""
+        """Return the network's values (B, A) of states (B, C, H, W) in 0..255; change nothing."""
         return self.all_values(self._online, states)
 
     def all_values(self, replicas: Replicas, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
@@ -88,19 +88,19 @@ class ActionValues:
         return values
 
     def _shards(self, *batch: npt.NDArray[Any]) -> list[tuple[npt.NDArray[Any], ...]]:
-        """Return the arrays of a batch cut into shards, none of them empty."""
+        """Split the arrays of a batch into non-empty shards."""
         count = min(self.shards, len(batch[0]))
         return [*zip(*(np.array_split(array, count) for array in batch), strict=True)]
 
     def _map_shards(self, function: Callable[..., T], shards: Sequence[tuple[npt.NDArray[Any], ...]]) -> list[T]:
-        """Call a function with the number and the arrays of each shard, in a thread each; a lone one in this thread."""
+        """Call a function with each shard's number and arrays, in a thread each; a single one in this thread."""
         over = map if len(shards) == 1 else self._threads.map
         return [*over(function, range(len(shards)), *zip(*shards, strict=True))]
 
     def _input(self, states: npt.NDArray[np.uint8]) -> torch.Tensor:
         """Return states in [0, 1] in the precision of the forward pass, channels last."""
         batch, channels, height, width = states.shape
-        # OpenCV moves channels of bytes: torch takes longer for it than for the rest of this function.
+        # OpenCV moves the channels, as bytes: in torch this takes longer than the rest of the function.
         bytes_BHWC = cv2.merge([states[:, channel].reshape(-1, width) for channel in range(channels)])
         x_BHWC = self._sent(bytes_BHWC.reshape(batch, height, width, channels))
         return x_BHWC.to(self.dtype).div_(255).permute(0, 3, 1, 2)

@@ -10,9 +10,8 @@ from atlantis_exp.networks.sizes import check_sides, convolved
 class DQNCnn(nn.Module):
     """Three convolutions and two dense layers (report figure 2.1; Mnih et al. 2015).
 
-    Input (B, C, H, W) in [0, 1], output that of the `head`, (B, num_actions) by default. The report fixes H = W = 84;
-    here the first dense layer follows from `input_shape` = (C, H, W). Raises ValueError if a side is below
-    `smallest_side`.
+    Maps (B, C, H, W) in [0, 1] to the output of `head`, (B, num_actions) by default. The report fixes H = W = 84; here
+    `input_shape` = (C, H, W) sizes the first dense layer. Raises ValueError if a side is below `smallest_side`.
     """
 
     smallest_side = 36  # pixels: 36 -> 8 -> 3 -> 1

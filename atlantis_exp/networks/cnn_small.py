@@ -10,8 +10,8 @@ from atlantis_exp.networks.sizes import check_sides, convolved
 class SmallCnn(nn.Module):
     """Two convolutions and one hidden layer (Mnih et al. 2013, section 4.1): three tenths of DQNCnn's FLOPs at 84x84.
 
-    Input (B, C, H, W) in [0, 1], output that of the `head`, (B, num_actions) by default. The first dense layer follows
-    from `input_shape` = (C, H, W). Raises ValueError if a side is below `smallest_side`.
+    Maps (B, C, H, W) in [0, 1] to the output of `head`, (B, num_actions) by default. `input_shape` = (C, H, W) sizes
+    the first dense layer. Raises ValueError if a side is below `smallest_side`.
     """
 
     smallest_side = 20  # pixels: 20 -> 4 -> 1

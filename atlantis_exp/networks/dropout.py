@@ -1,13 +1,13 @@
-"""Dropout with an owner for its randomness."""
+"""Dropout with its own random generator."""
 
 import torch
 from torch import nn
 
 
 class Dropout(nn.Dropout):
-    """Dropout that draws its masks from `generator` and never from torch's global one; in eval mode the identity.
+    """Dropout that draws its masks from `generator`, never from torch's global one.
 
-    The generator is not in the `state_dict` of weights: the learner saves and restores its state.
+    The learner saves and restores the generator's state, which is not in the `state_dict` of weights.
     """
 
     def __init__(self, p: float) -> None:
@@ -22,10 +22,7 @@ class Dropout(nn.Dropout):
 
 
 def seed_dropout(network: nn.Module, seed: int) -> None:
-    """Give all dropout layers of a network one common generator, on the network's device, with this seed.
-
-    Call it once the network is on the device where it stays.
-    """
+    """Give all dropout layers of a network one seeded generator; call it when the network is on its final device."""
     generator = torch.Generator(next(network.parameters()).device).manual_seed(seed)
     for module in network.modules():
         if isinstance(module, Dropout):

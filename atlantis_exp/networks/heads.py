@@ -1,4 +1,4 @@
-"""Heads: the last layer of a network, from features to action values or their quantiles."""
+"""Map a network's features to action values or their quantiles, by its last layer."""
 
 from collections.abc import Callable
 from typing import TypeAlias
@@ -7,13 +7,13 @@ import torch
 from torch import nn
 
 Head: TypeAlias = Callable[[int, int], nn.Module]
-"""Makes the last layer for so many features and actions; the plain one is `nn.Linear`."""
+"""Makes the last layer for a number of features and of actions; the plain one is `nn.Linear`."""
 
 
 class QuantileHead(nn.Module):
     """N quantiles of the return of each action (Dabney et al. 2018).
 
-    Input (B, features), output (B, num_actions, N).
+    Maps (B, features) to (B, num_actions, N).
     """
 
     def __init__(self, features: int, num_actions: int, quantiles: int) -> None:
@@ -29,8 +29,8 @@ class QuantileHead(nn.Module):
 class DuelingHead(nn.Module):
     """A state's value plus each action's advantage, whose mean is 0 (Wang et al. 2016, equation 9).
 
-    Input (B, features), output (B, num_actions). Each half of the features is one of the paper's two streams, so that a
-    dueling network is as large as a plain one: the streams of DQNCnn have 256 units each, the paper's 512.
+    Maps (B, features) to (B, num_actions). Each half of the features is one of the paper's two streams, so a dueling
+    network is as large as a plain one: the streams of DQNCnn have 256 units each, the paper's 512.
     """
 
     def __init__(self, features: int, num_actions: int) -> None:

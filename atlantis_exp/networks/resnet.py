@@ -9,10 +9,10 @@ from atlantis_exp.networks.sizes import check_sides, convolved
 
 
 class ResNetBlock(nn.Module):
-    """A basic residual block (He et al. 2016, figure 2; option B of section 4.1), which the report uses and leaves out.
+    """A basic residual block (He et al. 2016, figure 2; option B of section 4.1), which the report does not show.
 
-    Given `out_channels` it halves the sides, rounding up, and projects its shortcut with a 1x1 convolution of stride 2.
-    It departs from He et al. in its activation alone, and from the report's stem in normalising before activating.
+    With `out_channels` it halves the sides, rounding up, and projects its shortcut with a 1x1 convolution of stride 2.
+    Only its activation differs from He et al.; unlike the report's stem it normalises before activating.
     """
 
     def __init__(self, in_channels: int, activation: type[nn.Module], out_channels: int | None = None) -> None:
@@ -42,9 +42,8 @@ class ResNetBlock(nn.Module):
 class ResNetDQN(nn.Module):
     """Fourteen convolutions in the main path, four of them the stem, and two dense layers (report figure 2.2).
 
-    Input (B, C, H, W) in [0, 1], output that of the `head`, (B, num_actions) by default. The report fixes H = W = 159;
-    here the first dense layer follows from `input_shape` = (C, H, W). Raises ValueError if a side is below
-    `smallest_side`.
+    Maps (B, C, H, W) in [0, 1] to the output of `head`, (B, num_actions) by default. The report fixes H = W = 159; here
+    `input_shape` = (C, H, W) sizes the first dense layer. Raises ValueError if a side is below `smallest_side`.
     """
 
     smallest_side = 15  # pixels: 15 -> 7 -> 5 -> 3 -> 1

@@ -1,4 +1,4 @@
-"""The residual network that costs a tenth of the report's."""
+"""A residual network at a tenth of the report's cost."""
 
 import torch
 from torch import nn
@@ -27,12 +27,12 @@ class ResidualBlock(nn.Module):
 class ResNetFast(nn.Module):
     """A residual network whose stem shrinks the sides at once: 0.20 GFLOP a sample of an update at 159x159.
 
-    ResNetDQN needs 1.87, most of it in a stem that works on 77x77. Here the stem is DQNCnn's first layer; two stages
-    follow, a convolution that halves the sides and a residual block each, then two dense layers. No batch statistics,
-    no dropout. Its 3.4 million parameters are 6.9 MB in half precision.
+    ResNetDQN needs 1.87, most of it in a stem that works on 77x77. Here the stem is DQNCnn's first layer. Two stages
+    follow, each a convolution that halves the sides and a residual block, then two dense layers. It has no batch
+    statistics and no dropout. Its 3.4 million parameters take 6.9 MB in half precision.
 
-    Input (B, C, H, W) in [0, 1], output that of the `head`, (B, num_actions) by default. It is made for H = W = 159;
-    the first dense layer follows from `input_shape` = (C, H, W). Raises ValueError if a side is below `smallest_side`.
+    Maps (B, C, H, W) in [0, 1] to the output of `head`, (B, num_actions) by default. It is made for H = W = 159;
+    `input_shape` = (C, H, W) sizes the first dense layer. Raises ValueError if a side is below `smallest_side`.
     """
 
     smallest_side = 8  # pixels: 8 -> 1

@@ -1,4 +1,4 @@
-"""Transitions by id over a ring of observations."""
+"""Store observations once, and return transitions by id."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -25,8 +25,8 @@ class Returns:
     """The n-step return of a transition: up to `n_step` rewards, then the value of the state after them.
 
     The memory keeps the game's rewards. The learner's are those times `scale`, their size to the power of `exponent`,
-    clipped to -`clip`..`clip`, summed with discount `gamma` a step. At an episode's end so far there are fewer rewards;
-    after a terminal step no value follows.
+    clipped to -`clip`..`clip`, summed with discount `gamma` a step. The latest transitions of an episode have fewer
+    rewards; after a terminal step no value follows.
     """
 
     gamma: float
@@ -36,7 +36,7 @@ class Returns:
     clip: float | None = None  # None: not clipped
 
     def reward(self, r_t: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-        """Return the learner's rewards for the game's."""
+        """Turn the game's rewards into the learner's."""
         reward = self.scale * r_t.astype(np.float64)
         if self.exponent != 1:
             reward = np.sign(reward) * np.abs(reward) ** self.exponent
@@ -56,17 +56,16 @@ class Transitions(NamedTuple):
 class ReplayMemory:
     """The newest observations of interleaved episodes, each stored once, read as transitions.
 
-    An entry is an observation with the step that led to it: its action, reward, whether it is terminal, and `back`,
-    the distance in ids to the observation before it (0: an episode's first). Entries never change once appended. A
-    transition has the id of its state's newest observation; it is available while it has a successor and all frames
-    of both states are stored. A state that reaches back beyond its episode repeats the first observation (report
-    figure 2.3, `is_new`).
+    An entry is an observation with the step that led to it: action, reward, whether it is terminal, and `back`, the
+    distance in ids to the previous observation (0: an episode's first). Entries never change. A transition has the id
+    of its state's newest observation; it is available while it has a successor and all frames of both states are
+    stored. A state that reaches back beyond its episode repeats the first observation (report figure 2.3, `is_new`).
 
     Args:
-        capacity: most observations held; an episode of n steps has n + 1.
+        capacity: maximum number of observations; an episode of n steps has n + 1.
         frame_shape: shape of an observation, (H, W).
         stack: observations in a state.
-        budget_bytes: bound on all the memory's bytes; observations that compress badly are forgotten earlier.
+        budget_bytes: bound on the memory's bytes; if observations compress badly, it forgets them earlier.
 
     Raises:
         ValueError: capacity or budget is too small for any use.
@@ -94,21 +93,21 @@ class ReplayMemory:
 
     @property
     def oldest_id(self) -> int:
-        """Id of the oldest observation still stored."""
+        """Id of the oldest stored observation."""
         return self._frames.oldest_id
 
     @property
     def next_id(self) -> int:
-        """Id that the next observation will get; the number of observations ever seen."""
+        """Id of the next observation; the number of observations so far."""
         return self._frames.next_id
 
     @property
     def nbytes(self) -> int:
-        """Bytes in use, never more than `budget_bytes`."""
+        """Bytes in use, at most `budget_bytes`."""
         return self._index_bytes + self._frames.nbytes
 
     def begin(self, env: int, observation: npt.NDArray[np.uint8]) -> None:
-        """Start an episode of environment `env`; the one before has ended."""
+        """Start an episode of environment `env`, whose previous one has ended."""
         self._append(self._frames.encode(observation), back=0, action=0, reward=0.0, terminal=False)
         self._newest[env] = self.next_id - 1
 
@@ -137,11 +136,11 @@ class ReplayMemory:
         return drawn[:count]
 
     def available(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-        """Tell which of any ids are available transitions."""
+        """Return which ids are available transitions."""
         return (ids >= self.oldest_id) & (ids < self.next_id) & self._available[ids % self.capacity]
 
     def completed(self, since: int) -> npt.NDArray[np.int64]:
-        """Return the ids of the available transitions whose last observation has id `since` or a later one."""
+        """Return the ids of the available transitions whose last observation has an id of at least `since`."""
         ids = np.arange(max(since, self.oldest_id), self.next_id)
         back = self._back[ids % self.capacity]
         previous = (ids - back)[back > 0]
@@ -152,7 +151,7 @@ class ReplayMemory:
         return self._reward[self._successors(ids) % self.capacity]
 
     def gather(self, ids: npt.NDArray[np.int64], returns: Returns) -> Transitions:
-        """Return whole transitions. Raises: ValueError if one is not available."""
+        """Return transitions. Raises: ValueError if one is not available."""
         first = last = self._successors(ids)
         r_t = returns.reward(self._reward[first % self.capacity])
         steps = np.ones(len(ids), np.int64)
@@ -164,7 +163,7 @@ class ReplayMemory:
             r_t += np.where(forward > 0, returns.gamma**steps * reward, 0.0)
             steps += forward > 0
         now, then = self._state(ids), self._state(last)
-        # A step apart, two states have all frames but one in common.
+        # Two states one step apart share all frames but one.
         frames = self._frames.decode(np.vstack((now, then[-1:] if returns.n_step == 1 else then)))
         terminal = self._terminal[last % self.capacity]
         return Transitions(
@@ -197,9 +196,9 @@ class ReplayMemory:
         }
 
     def load_segments(self, segments: Iterable[dict[str, Any]]) -> None:
-        """Become the memory that wrote `segments`, given oldest first; those wholly evicted may be missing.
+        """Restore the memory that wrote `segments`, oldest first; wholly evicted ones may be missing.
 
-        Eviction depends on the lengths of the entries alone, so appending them again leaves the same memory.
+        Eviction depends only on the lengths of the entries, so appending them again gives the same memory.
 
         Raises:
             ValueError: a segment is malformed, missing or does not fit; the memory is then unusable.
@@ -217,7 +216,7 @@ class ReplayMemory:
         self.check_valid()
 
     def load_newest(self, segments: Iterable[dict[str, Any]], next_id: int) -> None:
-        """Become the memory that wrote `segments`, without older observations; without any, go on at `next_id`.
+        """Restore the memory that wrote `segments`, without older observations; without any, continue at `next_id`.
 
         Raises:
             ValueError: as `load_segments`, but not for missing ones.
@@ -228,7 +227,7 @@ class ReplayMemory:
         self.check_valid()
 
     def is_under_way(self, env: int) -> bool:
-        """Tell whether an environment has an episode that steps can be added to."""
+        """Return whether an environment has an unfinished episode."""
         return env in self._newest and self.next_id - self._newest[env] <= _MAX_BACK
 
     @property
@@ -236,15 +235,15 @@ class ReplayMemory:
         return int(self._action.max())
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything in one segment."""
+        """Return the whole memory as one segment."""
         return self.segment(0)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Become the memory that returned `state`. Raises: ValueError as `load_segments`."""
+        """Restore the memory that returned `state`. Raises: ValueError as `load_segments`."""
         self.load_segments([state])
 
     def check_valid(self) -> None:
-        """Derive the links and counts from the entries and compare. Raises: ValueError if an invariant fails."""
+        """Compare links and counts with the entries. Raises: ValueError if an invariant fails."""
         ids = np.arange(self.oldest_id, self.next_id)
         slots = ids % self.capacity
         back = self._back[slots].astype(np.int64)

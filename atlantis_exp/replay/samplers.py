@@ -1,4 +1,4 @@
-"""Which transitions to learn from."""
+"""Choose the transitions to learn from."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -13,7 +13,7 @@ from atlantis_exp.replay.memory import ReplayMemory
 _MOST_ERROR = 1e30  # so that the sum of all priorities is finite
 _LEAST_ERROR = 1e-6  # added to every error, so that each transition may come again
 _MOST_PRIORITY = 2 * _MOST_ERROR
-_FOREIGN = "the sampler's priorities are not of this replay memory; resume=never keeps this run and begins anew"
+_FOREIGN = "the sampler's priorities do not match the replay memory; resume=never keeps this run and starts over"
 
 
 class Draw(NamedTuple):
@@ -24,7 +24,7 @@ class Draw(NamedTuple):
 
 
 class Sampler(Protocol):
-    """Chooses the transitions of a batch; after a draw with weights it is told the batch's errors."""
+    """Choose the transitions of a batch; after a draw with weights, receive the batch's errors."""
 
     def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> Draw:
         """Draw `batch_size` of the available transitions; ValueError if there are none."""
@@ -33,7 +33,7 @@ class Sampler(Protocol):
         """Note the absolute TD errors (B,) of transitions (B,)."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that a continuation needs besides the memory."""
+        """Return the state that a continued training needs besides the memory."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a state that `state_dict` returned."""
@@ -52,7 +52,7 @@ class _Stateless:
 
 @dataclass(frozen=True)
 class UniformSampler(_Stateless):
-    """Every available transition is as likely as any other."""
+    """Draw available transitions with equal probability."""
 
     def sample(self, memory: ReplayMemory, batch_size: int, rng: np.random.Generator) -> Draw:
         return Draw(memory.draw(batch_size, rng), None)
@@ -60,10 +60,10 @@ class UniformSampler(_Stateless):
 
 @dataclass(frozen=True)
 class TopHalfSampler(_Stateless):
-    """Of `oversample` times the batch drawn uniformly, the transitions of highest reward, best first.
+    """Draw `oversample` times the batch uniformly, and keep the transitions of highest reward, best first.
 
-    With 2, the report's (section 4): "sample twice the specified batch size, sort the samples decreasingly by reward,
-    then take only the top half". Of equal rewards the one drawn earlier comes first.
+    2 is the report's (section 4): "sample twice the specified batch size, sort the samples decreasingly by reward,
+    then take only the top half". Ties keep the order of the draw.
     """
 
     oversample: Oversample
@@ -74,18 +74,18 @@ class TopHalfSampler(_Stateless):
 
 
 class PrioritizedSampler:
-    """A transition is as likely as its last error to the power `alpha` (Schaul et al. 2016, proportional).
+    """Draw transitions in proportion to their last error to the power `alpha` (Schaul et al. 2016).
 
-    Weights correct for that by the power `beta`; the least likely transition of a batch has weight 1. A new transition
-    gets the highest priority so far. Draws are stratified: one from each of `batch_size` equal parts of the sum of all
-    priorities. Takes 16 to 32 bytes for each observation of the memory's capacity.
+    Weights correct for that with the power `beta`; the least likely transition of a batch has weight 1. A new
+    transition gets the highest priority so far. Draws are stratified: one from each of `batch_size` equal parts of the
+    sum of all priorities. Takes 16 to 32 bytes for each observation of the memory's capacity.
     """
 
     def __init__(self, alpha: Probability, beta: Probability) -> None:
         self.alpha = alpha
         self.beta = beta
-        # A binary tree of sums: node n is the sum of 2n and 2n + 1, the leaves are the second half, one a slot of the
-        # memory's ring. Sums are never updated by differences, so that the leaves alone determine all bits.
+        # A binary tree of sums: node n is the sum of 2n and 2n + 1; the second half are leaves, one a slot of the
+        # memory's ring. Sums are never updated by differences, so the leaves alone determine all bits.
         self._tree = np.zeros(2)
         self._capacity = 0  # of the memory
         self._highest = 1.0  # priority
@@ -99,7 +99,7 @@ class PrioritizedSampler:
         slots = self._find((np.arange(batch_size) + rng.random(batch_size)) / batch_size)
         while True:
             ids = memory.oldest_id + (slots - memory.oldest_id) % memory.capacity
-            gone = ~memory.available(ids)  # part of its first state was forgotten
+            gone = ~memory.available(ids)  # the memory has forgotten part of their first state
             if not gone.any():
                 break
             self._set(slots[gone], np.zeros(np.count_nonzero(gone)))
@@ -125,7 +125,7 @@ class PrioritizedSampler:
         """Continue from a state that `state_dict` returned. Raises: ValueError."""
         priorities, highest = state["priorities"], float(state["highest"])
         if priorities.dtype != np.float64 or not np.all((priorities >= 0) & (priorities <= _MOST_PRIORITY)):
-            raise ValueError("the sampler's priorities are not finite numbers from 0 up")
+            raise ValueError("the sampler's priorities are not all finite and at least 0")
         if not 0 < highest <= _MOST_PRIORITY:
             raise ValueError(f"the sampler's highest priority is {highest}")
         self._plant(priorities)

@@ -1,5 +1,5 @@
-"""What a run is on disk: its folder, who holds it, its journal, its result, its tables of episodes.
+"""Keep a run on disk: its folder, lock, journal, result and tables of episodes.
 
-In: the records and files of a session. Out: the same, to any reader; only what is committed counts. It must not know
-torch, MLflow, or how a run is trained, played or compared.
+In: the records and files of a session. Out: the committed ones, for any reader. The package must not know torch,
+MLflow, or how a run is trained, played or compared.
 """

@@ -26,11 +26,11 @@ class EpisodeTable:
     frames: Array  # (episodes,)
     truncated: Array  # (episodes,), 1 where the time cap ended it
     counts: Array  # steps, (episodes, actions, 2): chosen by the network, by chance
-    points: Array  # (episodes, sources), the scores' parts; NaN where an older version did not record them
+    points: Array  # (episodes, sources), the scores' parts; NaN if an older version did not record them
     sources: tuple[str, ...]  # of points
 
     def to_csv(self) -> str:
-        """Return the table with a header: steps by action, those that chance chose, and points by source."""
+        """Return the table with a header: steps by action, the random ones, and points by source."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         by_chance = [f"{action}_random" for action in self.actions]
@@ -44,7 +44,7 @@ class EpisodeTable:
 
     @classmethod
     def read(cls, path: Path, sources: Sequence[str] = ()) -> Self:
-        """Read a file's table with the points of these sources. Raises: ValueError, OSError."""
+        """Read a table with the points of these sources. Raises: ValueError, OSError."""
         try:
             header, *lines = csv.reader(io.StringIO(read_file(path, SMALL).decode(), newline=""), strict=True)
             rows = [dict(zip(header, line, strict=True)) for line in lines]
@@ -58,7 +58,7 @@ class EpisodeTable:
             raise ValueError("it has none")
         actions = tuple(name.removesuffix("_random") for name in rows[0] if name.endswith("_random"))
         if not actions:
-            raise ValueError("it does not say who chose the actions: play it again")
+            raise ValueError("it does not say who chose the actions: evaluate again")
         chance = np.array([[float(row[f"{action}_random"]) for action in actions] for row in rows])
         both = np.array([[float(row[action]) for action in actions] for row in rows])
         scores, steps, frames, truncated = (
@@ -68,6 +68,6 @@ class EpisodeTable:
         points = np.array([[float(row.get(source, "nan")) for source in sources] for row in rows])
         counts = np.stack((both - chance, chance), axis=2)
         for numbers in (scores, steps, frames, truncated, counts, np.nan_to_num(points)):
-            if not np.all(np.abs(numbers) <= 1e15):  # whose squares a mean still holds
+            if not np.all(np.abs(numbers) <= 1e15):  # so that a mean of squares does not overflow
                 raise ValueError("it has numbers beyond 1e15")
         return cls(actions, seeds, scores, steps, frames, truncated, counts, points, tuple(sources))

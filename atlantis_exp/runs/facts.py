@@ -10,7 +10,7 @@ from atlantis_exp.runs.journal import Artifact, Record, Tags, read, read_commit
 
 
 class JournalFacts(NamedTuple):
-    """The last value of each tag, and the names of the files under `artifacts/`, as of the last commit."""
+    """The last value of each tag, and the names of the files under `artifacts/`, at the last commit."""
 
     tags: dict[str, str]
     artifacts: tuple[str, ...]  # each once, in order
@@ -32,7 +32,7 @@ def read_tags(folder: Path) -> dict[str, str]:
 
 
 def _records(folder: Path, kind: str) -> Iterator[Record]:
-    """Yield the committed records of a kind; parse no other line."""
+    """Yield the committed records of a kind, and parse only these."""
     commit = read_commit(folder)
     if commit is None or commit.offset == 0:
         return

@@ -1,6 +1,6 @@
-"""Write files of run folders whole, and read them within bounds: they may come from anybody.
+"""Write files of run folders whole, and read them within limits: anybody may have written them.
 
-No symbolic link is followed and no hard link written through, since both lead to another folder's files.
+Follow no symbolic link and write through no hard link, since both lead to another folder's files.
 """
 
 import errno
@@ -28,14 +28,14 @@ _schemas: dict[Any, TypeAdapter[Any]] = {}
 
 
 def schema_of(kind: type[T]) -> TypeAdapter[T]:
-    """Return the pydantic schema of a class, made on first use: all at import would take 0.1 s."""
+    """Return the pydantic schema of a class, built on first use: all at import would take 0.1 s."""
     if kind not in _schemas:
         _schemas[kind] = TypeAdapter(kind)
     return _schemas[kind]
 
 
 def checked(kind: type[T], values: Mapping[str, Any]) -> T:
-    """Make an instance of a class from plain values. Raises: ValueError, in one line."""
+    """Make an instance of a class from plain values. Raises: ValueError with one line."""
     try:
         return schema_of(kind).validate_python(values)
     except ValidationError as error:
@@ -44,12 +44,12 @@ def checked(kind: type[T], values: Mapping[str, Any]) -> T:
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a regular file for reading. Raises: OSError, ValueError if it is of another kind."""
+    """Open a regular file for reading. Raises: OSError; ValueError for another kind of file."""
     try:
         file = open(path, "rb", opener=no_link)  # noqa: SIM115
     except OSError as error:
         if error.errno == errno.ELOOP:
-            raise ValueError(f"{path} is not a regular file, but a link") from None
+            raise ValueError(f"{path} is a link, not a regular file") from None
         raise
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
@@ -66,14 +66,14 @@ def read_file(path: Path, most: int) -> bytes:
 
 
 def no_link(path: str, flags: int) -> int:
-    """Open a file as `opener` of `open`: no symbolic link, hard links cut before writing, pipes not blocking."""
+    """Open a file, as `opener` of `open`: refuse symbolic links, cut hard links before writing, wait for no pipe."""
     if flags & (os.O_WRONLY | os.O_RDWR):
         own(Path(path))
     return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
 
 
 def own(path: Path) -> None:
-    """Replace a regular file that has a second name, as after `cp -al`, by a copy of its own. Raises: OSError."""
+    """Replace a regular file that has a second name, as after `cp -al`, by a copy. Raises: OSError."""
     with suppress(FileNotFoundError):
         found = path.lstat()
         if stat.S_ISREG(found.st_mode) and found.st_nlink > 1:
@@ -84,7 +84,7 @@ def own(path: Path) -> None:
 
 
 def inside(folder: Path, path: str) -> Path:
-    """Return the file in a run's folder that a path names. Raises: ValueError if it leads out of the folder."""
+    """Return the file at a path in a run's folder. Raises: ValueError if it leads out of the folder."""
     root = folder.parent.resolve() / folder.name
     file = (root / path).resolve()
     if root not in file.parents:
@@ -93,12 +93,12 @@ def inside(folder: Path, path: str) -> Path:
 
 
 def is_whole(content: bytes, sha256: str) -> bool:
-    """Tell whether a content has a checksum; an empty one, as 0.1.0 wrote it, fits any content."""
+    """Return whether content has a checksum; an empty one, of 0.1.0, fits any content."""
     return sha256 in ("", hashlib.sha256(content).hexdigest())
 
 
 def read_object(content: bytes) -> dict[str, Any]:
-    """Return the object that JSON holds. Raises: ValueError, also for JSON that is nested too deep."""
+    """Parse a JSON object. Raises: ValueError, also for too deep nesting."""
     tree = from_json(content)  # bounds the depth; `json` would raise RecursionError
     if not isinstance(tree, dict):
         raise ValueError(f"should be an object, is {type(tree).__name__}")
@@ -114,7 +114,7 @@ def make_folder(folder: Path) -> None:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Put a file in place whole and durable, or not at all. Raises: OSError."""
+    """Write a file whole and durably, or not at all. Raises: OSError."""
     make_folder(path.parent)
     aside = path.with_name(path.name + ".aside")
     with open(aside, "wb", opener=no_link) as file:
@@ -127,7 +127,7 @@ def write_file(path: Path, content: bytes) -> None:
 
 @contextmanager
 def whole(folder: Path) -> Iterator[Path]:
-    """Yield a folder to fill that becomes `folder` if the block ends well. Raises: OSError."""
+    """Yield a folder to fill, which becomes `folder` if the block succeeds. Raises: OSError."""
     aside = folder.with_name(folder.name + ".aside")
     shutil.rmtree(aside, ignore_errors=True)
     make_folder(aside)

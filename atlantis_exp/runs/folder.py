@@ -1,4 +1,4 @@
-"""Run folders: their places, files, holders and results."""
+"""Find run folders, and read their files, holders and results."""
 
 import json
 import math
@@ -20,20 +20,20 @@ CONFIG, RESULT, COMMIT = "config.json", "result.json", "commit.json"
 CHECKPOINTS = "checkpoints"  # the folder of a training's
 TRACEBACK = "traceback.txt"  # of the run's latest failure
 LOOKS = "looks.json"  # of a comparison
-OUTPUT = "output.txt"  # printed by a run that a launcher started
+OUTPUT = "output.txt"  # of a run that a launcher started
 
 # Artifacts.
 EPISODES = "episodes.csv"  # of the training
 BEST_EPISODE = "best_episode.mp4"
 NETWORK = "network"  # the models that are a training's networks
-EVALUATION, EVALUATION_REPORT = "evaluation/episodes.csv", "evaluation/report.txt"  # of a run that is one evaluation
+EVALUATION, EVALUATION_REPORT = "evaluation/episodes.csv", "evaluation/report.txt"  # of an `evaluate` run
 
 TABLE_COLUMNS = ("mean", "standard_error", "median", "interquartile_mean", "high", "low")
-"""The parts of a summary of scores that a row of a table shows, in order."""
+"""The columns of a table of scores, in order."""
 EVALUATED = {*(f"evaluation/{point}" for point in (*TABLE_COLUMNS, "episodes", "epsilon")), "actions/random_share"}
 """The metrics of an evaluation that tables show."""
-LOST = "lost"  # the tag of a run that lost a part of its replay memory: not the unbroken one bit for bit
-_HOLD_SECONDS = 2.0  # to wait for a run, which another command may hold for a moment
+LOST = "lost"  # the tag of a run that lost a part of its replay memory, and its bit-for-bit equality
+_HOLD_SECONDS = 2.0  # to wait for a run that another command may hold briefly
 
 State = Literal["done", "running", "failed", "interrupted", "queued"]
 T = TypeVar("T")
@@ -46,12 +46,12 @@ def evaluation_at(step: int) -> str:
 
 @dataclass(frozen=True)
 class Result:
-    """How a run ended: the numbers of its last evaluation and the report's table of them."""
+    """The result of a run: the numbers of its last evaluation and the report's table of them."""
 
     outcome: str
     steps: Natural
     counts: dict[str, float]  # episodes, frames, updates, FLOPs of updates and hours of a training
-    evaluation: dict[str, float]  # empty where there was none
+    evaluation: dict[str, float]  # empty without one
     report: str
     evaluated_at: Natural | None = None  # step of the last evaluation, if that was before the last one
 
@@ -60,14 +60,14 @@ class Result:
             raise ValueError(f"its evaluation lacks {min(missing)}")
 
     def spent(self, limits: Mapping[str, float]) -> dict[str, float]:
-        """Return those of a budget's limits that the training has reached."""
+        """Return the budget's limits that the training has reached."""
         done = {"budget.steps": self.steps, "budget.flops": self.counts.get("flops", 0)}
         return {key: limit for key, limit in limits.items() if done[key] >= limit}
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """One run's folder: `config.json` at its start, `result.json` at its end; a damaged file raises Fault."""
+    """A run's folder: it has `config.json` from its start, `result.json` from its end; a damaged file raises Fault."""
 
     path: Path
 
@@ -78,7 +78,7 @@ class RunFolder:
 
     @property
     def name(self) -> str:
-        """The run's name, in UTF-8 whatever its folder's bytes are."""
+        """The run's name, in UTF-8 even if its folder's name is not."""
         return os.fsencode(self.path.name).decode(errors="replace")
 
     @property
@@ -86,7 +86,7 @@ class RunFolder:
         return self.path / CHECKPOINTS
 
     def artifact(self, name: str) -> Path:
-        """Return a file that the journal names. Raises: ValueError if it leads out of the folder."""
+        """Return the file of an artifact. Raises: ValueError if its name leads out of the folder."""
         return inside(self.path / "artifacts", name)
 
     @property
@@ -101,7 +101,7 @@ class RunFolder:
 
     @property
     def trained_config(self) -> Config:
-        """The config of a training run. Raises: ConfigError, naming its file."""
+        """The config of a training run. Raises: ConfigError that names its file."""
         try:
             return parse(Config, self.config)
         except ConfigError as error:
@@ -109,26 +109,26 @@ class RunFolder:
 
     @property
     def result(self) -> Result | None:
-        """How the run ended, None before its end."""
+        """The run's result, or None before its end."""
         return _read(self.path / RESULT, Result)
 
     @property
     def final_result(self) -> Result | None:
-        """How the run ended; None also while it is made longer, when `result` is an earlier end."""
+        """The run's result; None also while a longer training replaces it."""
         return self.result if self.state == "done" else None
 
     def ended(self, limits: Mapping[str, float]) -> Result | None:
-        """Return the result of an ended run, None if it can go on, as after its budget was raised."""
+        """Return the result of an ended run, or None if it can continue, as after a raise of its budget."""
         if not self.has_started or (result := self.result) is None:
             return None
         return None if result.outcome == "budget" and not result.spent(limits) else result
 
     def beyond(self, limits: Mapping[str, float]) -> tuple[str, str] | None:
-        """Return the limit that the run was trained beyond and what it was trained for; None where it was not."""
+        """Return the limit that the training has exceeded and its actual length, or None."""
         if (result := self.result) is None:
             return None
         config = self.trained_config
-        # All environments step at once, and the updates that fall due with their steps are made at once.
+        # All environments step at once, and then all due updates.
         updates = math.ceil(config.env.num_envs / config.training.learn_every)
         steps, most = limits.get("budget.steps"), limits.get("budget.flops")
         if steps is not None and result.steps - config.env.num_envs >= steps:
@@ -139,21 +139,21 @@ class RunFolder:
         return None
 
     def put_aside(self) -> Path:
-        """Rename the folder to make room for a new run; return its new place. Raises: Fault while held."""
+        """Rename the folder to make room for a new run; return its new path. Raises: Fault while held."""
         kept = next(path for n in range(1, 10_000) if not (path := self.path.with_name(f"{self.name}~{n}")).exists())
         with self.held():
             return self.path.rename(kept)
 
     @property
     def has_lost_checkpoints(self) -> bool:
-        """Whether the run has committed but its checkpoints are missing, as in a copy without them."""
+        """Whether the run has commits but no checkpoints, as in a copy without them."""
         commit = self.commit
         was_committed = (commit is not None and commit.offset > 0) or has_lost_commit(self.path)
         return was_committed and not any(self.checkpoints.glob("*/manifest.json"))
 
     @property
     def commit(self) -> Commit | None:
-        """The last commit, None before the first commit or status."""
+        """The last commit; None before the first commit or status."""
         return read_commit(self.path)
 
     def records(self) -> Iterator[Record]:
@@ -170,7 +170,7 @@ class RunFolder:
 
     @property
     def status(self) -> Status | None:
-        """The last status written, None before the first."""
+        """The last status written; None before the first."""
         return commit.status if (commit := self.commit) else None
 
     @property
@@ -179,18 +179,18 @@ class RunFolder:
 
     @property
     def parent(self) -> Path | None:
-        """The folder of the sweep that the run was last part of."""
+        """The folder of the run's latest sweep."""
         return self.path / commit.parent if (commit := self.commit) and commit.parent else None
 
     @property
     def state(self) -> State:
-        """The run's state; a run whose process was killed is interrupted, whatever its journal says."""
+        """The run's state; after a kill it is interrupted, whatever the journal says."""
         if not self.has_started:
             return "failed" if self.status == "FAILED" else "queued"
         status = self.status
         if status == "FAILED":
             return "failed"
-        if self.result is not None and status not in ("RUNNING", "KILLED"):  # as a run is that is made longer
+        if self.result is not None and status not in ("RUNNING", "KILLED"):  # else a longer training replaces it
             return "done"
         has_ended = status not in (None, "SCHEDULED", "RUNNING")
         return "running" if not has_ended and self.is_held else "interrupted"
@@ -201,7 +201,7 @@ class RunFolder:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Hold the run against other processes. Raises: Fault naming the process that holds it."""
+        """Lock the run against other processes. Raises: Fault that names its holder."""
         with lock.held(self.path, f"run {self.name}", _HOLD_SECONDS):
             yield
 
@@ -223,7 +223,7 @@ def all_runs(outputs: Path) -> list[RunFolder]:
 
 
 def find_run(outputs: Path, name: str) -> RunFolder:
-    """Return the training run with a name, with a unique start of a name, or the latest.
+    """Return the training run with a name or a unique start of one, or the latest.
 
     Raises:
         ConfigError: no run or several match.
@@ -254,7 +254,7 @@ def find_run(outputs: Path, name: str) -> RunFolder:
 
 
 def has_ended(config: Config) -> bool:
-    """Return whether the training that a config is has ended, and its budget asks for no more."""
+    """Return whether a config's training has ended and its budget allows no more."""
     return RunFolder.of(config).ended(config.budget.limits) is not None
 
 
@@ -262,4 +262,4 @@ def _read(path: Path, kind: type[T]) -> T | None:
     try:
         return schema_of(kind).validate_json(read_file(path, SMALL), strict=True) if path.exists() else None
     except ValueError:
-        raise Fault(f"{path} is damaged: remove it and repeat the run's command, which writes it anew") from None
+        raise Fault(f"{path} is damaged: remove it and repeat the run's command, which rewrites it") from None

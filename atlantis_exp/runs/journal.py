@@ -1,8 +1,8 @@
-"""The journal of a run: what happened, durable, exactly once.
+"""Write and read a run's journal, whose records are durable and appear exactly once.
 
-A run folder holds `journal.jsonl` (one record a line), `artifacts/` (the files that records name) and `commit.json`
-(how much of the journal counts). Lines become durable with `Journal.state_dict`, and visible with `Journal.commit` once
-a checkpoint holds that state. A resumed run redoes what came later and journals it again, so nothing appears twice.
+A run folder has `journal.jsonl` (one record a line), `artifacts/` (the files of records) and `commit.json` (the
+journal's committed length). `Journal.state_dict` makes lines durable, and `Journal.commit` makes them visible once a
+checkpoint has that state. A resumed run repeats later steps and journals them again, so nothing appears twice.
 """
 
 import hashlib
@@ -33,14 +33,14 @@ from atlantis_exp.runs.files import (
 )
 
 Status = Literal["SCHEDULED", "RUNNING", "FINISHED", "FAILED", "KILLED"]
-NOTE_LENGTH = 7_900  # characters; MLflow cuts a description at 8,000 without a word
+NOTE_LENGTH = 7_900  # characters; MLflow silently cuts a description at 8,000
 NOTE = "mlflow.note.content"
 """The tag that MLflow shows as markdown at the top of a run's page."""
 
 
 @dataclass(frozen=True)
 class Metrics:
-    """Values measured at one step; `time` is in ms since 1970 and never decreases along a journal."""
+    """Values measured at one step; `time`, in ms since 1970, never decreases along a journal."""
 
     step: int
     time: int
@@ -63,7 +63,7 @@ class Tags:
 
 @dataclass(frozen=True)
 class Artifact:
-    """A file under `artifacts/`, with its SHA-256: the one on disk may be newer than the last commit."""
+    """A file under `artifacts/`, with its SHA-256, since the one on disk may be newer than the last commit."""
 
     path: str
     sha256: str = ""  # empty in journals of 0.1.0
@@ -71,7 +71,7 @@ class Artifact:
 
 @dataclass(frozen=True)
 class Image:
-    """A PNG under `artifacts/`: one position, which MLflow calls a step, of the slider of `key`."""
+    """A PNG under `artifacts/` at one position, which MLflow calls a step, of the slider of `key`."""
 
     key: str
     step: int
@@ -81,7 +81,7 @@ class Image:
 
 @dataclass(frozen=True)
 class Model:
-    """Weights as safetensors under `artifacts/`, with the metrics that they reached and the file's SHA-256."""
+    """Weights as safetensors under `artifacts/`, with their metrics and the file's SHA-256."""
 
     name: str
     step: int
@@ -98,12 +98,11 @@ _KINDS: dict[str, type[Record]] = {kind.__name__.lower(): kind for kind in get_a
 
 @dataclass(frozen=True)
 class Commit:
-    """How much of a journal counts, and what state its run is in.
+    """The committed length of a journal and the state of its run.
 
-    `identity` is unique to the run and changes when committed lines are taken back; `started` and `updated` are in ms
-    since 1970, `offset` in bytes. `labels` are tags that hold from a run's first moment, even if it fails before
-    anything is committed; `error` is why it failed; `parent` is the folder, seen from this one, of the run that it is
-    shown under.
+    `identity` is unique to the run and changes when the journal drops committed lines; `started` and `updated` are in
+    ms since 1970, `offset` in bytes. `labels` are tags that a run has from its start, even if it fails before its first
+    commit; `error` is the reason of a failure; `parent` is the relative path of the run above it in MLflow.
     """
 
     identity: str
@@ -117,14 +116,14 @@ class Commit:
 
 
 class JournalError(Fault, ValueError):
-    """A journal that cannot be continued from."""
+    """A damaged journal."""
 
 
-_POINT_BYTES = 2_000  # between two points that `curve` reads; about three lines of a journal
+_POINT_BYTES = 2_000  # between two points of `curve`; about three lines of a journal
 
 
 class Tracker:
-    """The null object of tracking: takes all that a training records, and forgets it."""
+    """The null object of tracking, which forgets all records."""
 
     def metrics(self, values: Mapping[str, float], step: int) -> None:
         """Record values measured at a step."""
@@ -142,58 +141,57 @@ class Tracker:
         """Keep a file under a relative path; the last content of a path counts."""
 
     def image(self, key: str, content: bytes, step: int) -> None:
-        """Keep a PNG at a position of its key's slider; runs that share positions are shown side by side."""
+        """Keep a PNG at a position of its key's slider; MLflow shows runs with equal positions side by side."""
 
     def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None:
-        """Keep weights (safetensors) of a step and the metrics that they reached; `best` of all of the name so far."""
+        """Keep weights (safetensors) of a step and their metrics; `best` of all with the name so far."""
 
     def status(self, status: Status, error: str = "") -> None:
-        """Make the run's state visible, and the reason of a failure, but no records."""
+        """Make the run's state and the reason of a failure visible, but no records."""
 
     def commit(self) -> None:
-        """Make all records of the latest state visible; call it once a checkpoint with that state is durable."""
+        """Make all records of the latest state visible; call it when a checkpoint with that state is durable."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Make all records durable and return where they end."""
+        """Make all records durable and return their end."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go back to where the state ends; later records are forgotten."""
+        """Go back to the state's end and forget later records."""
 
 
 class Journal(Tracker):
     """A tracker that writes a run folder, which has one writer at a time.
 
-    Without `load_state_dict` it begins an empty journal, even in a folder that holds one. Names are checked against
-    MLflow's alphabet.
+    Without `load_state_dict` it starts an empty journal, even in a folder that has one.
 
     Raises:
         JournalError: `commit.json` or a line is damaged, or the journal was cut or replaced meanwhile.
         ValueError: MLflow would refuse a name, or a path leads out of `artifacts/`.
-        OSError: the disk refuses; durable lines stay so, and a later `state_dict` writes the rest.
+        OSError: the disk refuses; durable lines stay, and a later `state_dict` writes the rest.
     """
 
     def __init__(self, folder: Path, labels: Mapping[str, str] | None = None) -> None:
         make_folder(folder)
         self._folder = folder
         self._time = _now()  # ms, of the latest metrics
-        self._offset = 0  # bytes that are durable and in the state
-        self._lines: list[bytes] = []  # since the last checkpoint: a resumed run redoes them, so memory suffices
-        commit = read_commit(folder) or _unborn()
+        self._offset = 0  # durable bytes of the state
+        self._lines: list[bytes] = []  # since the last checkpoint: a resumed run repeats them, so memory suffices
+        commit = read_commit(folder) or _new_commit()
         if commit.status == "SCHEDULED":
             commit = replace(commit, started=self._time, status="RUNNING")
         named = {_name(key): value for key, value in (labels or {}).items()}
         self._commit = replace(commit, labels={**commit.labels, **named})
 
     def resume(self) -> bool:
-        """Continue after the last commit, for a writer without checkpoints; return whether there is one."""
+        """Continue after the last commit, without a checkpoint; return whether there is one."""
         if not self._commit.offset:
             return False
         self.load_state_dict({"offset": self._commit.offset, "time": self._commit.updated})
         return True
 
     def recover(self) -> None:
-        """Commit all whole lines again, for an ended run whose `commit.json` was removed."""
+        """Commit all whole lines of an ended run whose `commit.json` was removed."""
         with open_file(self._folder / "journal.jsonl") as file:
             self._offset = sum(len(line) for line in iter(partial(file.readline, SMALL), b"") if line.endswith(b"\n"))
         self.commit()
@@ -222,10 +220,10 @@ class Journal(Tracker):
 
     def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None:
         if set("/.") & set(name):
-            raise ValueError(f"A model's name holds neither '/' nor '.': {name!r}")
+            raise ValueError(f"A model's name must not contain '/' or '.': {name!r}")
         path = model_file(_name(name), step)
         digest = self._write(path, content)
-        # MLflow charts a model's metrics on the run, too: at the time of the metrics just recorded they coincide.
+        # MLflow charts a model's metrics on the run, too: with the time of the last metrics they coincide.
         self._append(Model(name, step, self._time, path, _numbers(metrics), best, digest))
 
     def status(self, status: Status, error: str = "") -> None:
@@ -235,7 +233,7 @@ class Journal(Tracker):
         self._mark(replace(self._commit, offset=self._offset))
 
     def flush(self) -> None:
-        """Make all records durable and visible; for a writer without checkpoints."""
+        """Make all records durable and visible, without a checkpoint."""
         self.state_dict()
         self.commit()
 
@@ -246,7 +244,7 @@ class Journal(Tracker):
 
     def state_dict(self) -> dict[str, Any]:
         if self._offset < self._commit.offset:
-            self._mark(replace(self._commit, offset=self._offset))  # readers first: the bytes change under them next
+            self._mark(replace(self._commit, offset=self._offset))  # tell readers before the bytes change
         content = b"".join(self._lines)
         _write_from(self._folder, self._offset, content)
         self._offset += len(content)
@@ -257,10 +255,10 @@ class Journal(Tracker):
         path = self._folder / "journal.jsonl"
         try:
             if path.stat().st_size < state["offset"]:
-                raise ValueError(f"{path} is shorter than the checkpoint says: it was cut or replaced since")
+                raise ValueError(f"{path} is shorter than in the checkpoint: it was cut or replaced since")
             deque(read(self._folder, end=state["offset"]), maxlen=0)
         except ValueError as error:
-            advice = "restore it, or begin anew with resume=never, which keeps the old run"
+            advice = "restore it, or start over with resume=never, which keeps the old run"
             raise JournalError(f"{error}; {advice}") from None
         self._offset, self._time = state["offset"], state["time"]
         self._lines.clear()
@@ -275,7 +273,7 @@ class Journal(Tracker):
         self._lines.append(line.encode() + b"\n")
 
     def _mark(self, commit: Commit) -> None:
-        # Sent records cannot be taken back: a journal that goes back behind its commit is a new run to its readers.
+        # Sent records cannot be recalled: a journal that goes back behind its commit is a new run for its readers.
         identity = self._commit.identity if commit.offset >= self._commit.offset else uuid4().hex
         # A clock may have been set back: no run ends before it began.
         self._commit = replace(commit, identity=identity, updated=max(_now(), self._time, self._commit.updated))
@@ -283,7 +281,7 @@ class Journal(Tracker):
 
 
 def read_commit(folder: Path) -> Commit | None:
-    """Return a run folder's last commit, None before its first commit or status. Raises: JournalError."""
+    """Return a run folder's last commit, or None before its first commit or status. Raises: JournalError."""
     path = folder / "commit.json"
     try:
         return schema_of(Commit).validate_json(read_file(path, SMALL), strict=True) if path.exists() else None
@@ -292,9 +290,9 @@ def read_commit(folder: Path) -> Commit | None:
 
 
 def has_lost_commit(folder: Path) -> bool:
-    """Tell whether a run folder has a journal but has lost its `commit.json`. Raises: JournalError if it is damaged."""
+    """Return whether a run folder has a journal but lost its `commit.json`. Raises: JournalError if it is damaged."""
     commit, path = read_commit(folder), folder / "journal.jsonl"
-    is_new = commit is None or (commit.status == "SCHEDULED" and not commit.offset)  # as a sweep makes it anew
+    is_new = commit is None or (commit.status == "SCHEDULED" and not commit.offset)  # as a sweep recreates it
     return is_new and path.exists() and path.stat().st_size > 0
 
 
@@ -308,9 +306,9 @@ def model_file(name: str, step: int) -> str:
 
 
 def adopt(folder: Path, parent: Path) -> None:
-    """Put a run, started or not, under another one; nobody may be writing its folder. Raises: JournalError."""
+    """Put a run, started or not, under another one, while nobody writes its folder. Raises: JournalError."""
     make_folder(folder)
-    commit = read_commit(folder) or _unborn()
+    commit = read_commit(folder) or _new_commit()
     adopted = replace(commit, parent=os.path.relpath(parent, folder))
     if adopted != commit:
         _write_commit(folder, adopted)
@@ -350,19 +348,18 @@ def read(folder: Path, start: int = 0, end: int | None = None) -> Iterator[tuple
 
 
 def record_of(line: bytes, where: str) -> Record:
-    """Return the record in a line of a journal. Raises: ValueError, saying where."""
+    """Return the record in a line of a journal. Raises: ValueError that names the place."""
     try:
         fields = read_object(line)
         return schema_of(_KINDS[fields.pop("kind")]).validate_python(fields)
     except (ValueError, KeyError, TypeError):  # among them pydantic's, of several lines
-        raise ValueError(f"{where}: not a record of a journal: {line[:60]!r}") from None
+        raise ValueError(f"{where}: not a journal record: {line[:60]!r}") from None
 
 
 def curve(folder: Path, keys: Sequence[str], points: int = 500) -> Iterator[Metrics]:
-    """Yield the committed metrics that hold all of some keys; about `points` of a long journal, in constant time.
+    """Yield the committed metrics that have all keys; about `points` of a long journal, in constant time.
 
-    A journal of over 2,000 bytes a point is cut into stretches of equal length. The first point of each is taken, and
-    the last of all.
+    From a journal of over 2,000 bytes a point it takes the first point of each of equal stretches, and the last of all.
 
     Raises:
         ValueError: as `read`.
@@ -375,7 +372,7 @@ def curve(folder: Path, keys: Sequence[str], points: int = 500) -> Iterator[Metr
                 yield record
         return
     with open_file(folder / "journal.jsonl") as file:
-        last = 0  # bytes, where the latest point taken ends
+        last = 0  # bytes, the end of the latest point
         for stretch in range(points):
             start, stop = stretch * end // points, (stretch + 1) * end // points
             if point := next(_points(file, keys, start, stop), None):
@@ -387,7 +384,7 @@ def curve(folder: Path, keys: Sequence[str], points: int = 500) -> Iterator[Metr
 
 
 def _points(file: BinaryIO, keys: Sequence[str], start: int, stop: int) -> Iterator[tuple[int, Metrics]]:
-    """Yield the metrics of all keys whose lines begin between two offsets, each with the offset where it ends."""
+    """Yield the metrics of all keys whose lines begin between two offsets, each with its end."""
     kind, wanted = b'{"kind":"metrics",', [f"{_encode(key)}:".encode() for key in keys]
     file.seek(max(start - 1, 0))
     position = start if start == 0 else start - 1 + len(file.readline(SMALL))  # a line's beginning
@@ -418,7 +415,7 @@ def _numbers(values: Mapping[str, float]) -> dict[str, float]:
     return {_name(key): float(value) for key, value in values.items()}
 
 
-def _unborn() -> Commit:
+def _new_commit() -> Commit:
     return Commit(uuid4().hex, _now(), _now(), 0, "SCHEDULED")
 
 
@@ -430,7 +427,7 @@ def _write_commit(folder: Path, commit: Commit) -> None:
 def _name(name: str) -> str:
     if len(name) > 250 or not re.fullmatch(r"\w[\w.\- ]*(/\w[\w.\- ]*)*", name, re.ASCII):
         raise ValueError(
-            f"MLflow takes letters, digits, '_.- ' and single inner slashes, 250 in all, as a name: {name!r}"
+            f"MLflow's names have up to 250 letters, digits, '_.- ' and single inner slashes, not {name!r}"
         )
     return name
 

@@ -1,4 +1,4 @@
-"""Hold a folder: one process at a time, until it ends, however it does."""
+"""Lock a folder for one process at a time, until it ends in any way."""
 
 import fcntl
 import os
@@ -11,19 +11,19 @@ from filelock import FileLock, Timeout
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import SMALL, make_folder, no_link, open_file, read_file
 
-_HOLDER = "holder.txt"  # not the lock itself, which is emptied when it is asked for
+_HOLDER = "holder.txt"  # not the lock itself, which each attempt empties
 _OF_OPTUNA = "trials.jsonl.lock"  # a link while a process writes
 
 
 @contextmanager
 def held(folder: Path, name: str, seconds: float) -> Iterator[None]:
-    """Hold a folder, made if need be, for the block; wait up to so many seconds for it.
+    """Lock a folder, created if needed, for the block; wait up to `seconds` for it.
 
     Raises:
         Fault: another process holds it (exit code 75), or it contains a symbolic link.
     """
     if (link := _link(folder)) is not None:
-        raise Fault(f"{name}: {link} is a link, which is not written through; replace it by a copy of its target")
+        raise Fault(f"{name}: {link} is a link; replace it by a copy of its target")
     make_folder(folder)
     try:
         lock = FileLock(folder / "lock").acquire(seconds)
@@ -43,14 +43,14 @@ def _holder(folder: Path) -> str:
 
 
 def _link(folder: Path) -> Path | None:
-    """Find a symbolic link: the folder itself or one in it, other than Optuna's lock of a search."""
+    """Find a symbolic link: the folder itself or one in it, except Optuna's lock of a search."""
     places = (Path(above, name) for above, folders, files in os.walk(folder) for name in (*folders, *files))
     links = (path for path in (folder, *places) if path.is_symlink())
     return next((link for link in links if link != folder / _OF_OPTUNA), None)
 
 
 def is_held(folder: Path) -> bool:
-    """Tell whether a process holds a folder, which may be read-only. Raises: OSError."""
+    """Return whether a process holds a folder, which may be read-only. Raises: OSError."""
     try:
         with open_file(folder / "lock") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # until it is closed
@@ -63,7 +63,7 @@ def is_held(folder: Path) -> bool:
 
 @contextmanager
 def alone(path: Path) -> Iterator[None]:
-    """Wait for a lock file and keep all other processes out of the block."""
+    """Wait for a lock file, and keep other processes out of the block."""
     make_folder(path.parent)
     with FileLock(path):
         yield

@@ -1,4 +1,4 @@
-"""The origin of a run: versions of code and libraries, and the command."""
+"""Record the origin of a run: versions of code and libraries, and the command."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ _LIBRARIES = ("atlantis-exp", "ale-py", "gymnasium", "torch", "numpy", "opencv-p
 
 
 def provenance(command: str) -> dict[str, str]:
-    """Return the tags that say which code, libraries and command make a run."""
+    """Return the tags for a run's code, libraries and command."""
     tags = {f"version.{name}": version(name) for name in _LIBRARIES}
     tags["version.python"] = sys.version.split()[0]
     checkout = Path(__file__).resolve().parents[2]

@@ -1,5 +1,5 @@
-"""MLflow as a mirror of run folders, which can be thrown away and made again from them.
+"""Mirror run folders in MLflow, whose store can be deleted and rebuilt from them.
 
-In: run folders. Out: MLflow runs, here or on a server. It must not know games, networks or how anything is trained;
-MLflow itself is imported here alone, on first use.
+In: run folders. Out: MLflow runs, here or on a server. The package must not know games, networks or training. Only this
+package imports MLflow, on first use.
 """

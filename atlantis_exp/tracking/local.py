@@ -1,4 +1,4 @@
-"""Work on the tables of the local store where MLflow's client is too slow or has no call: those of MLflow 3.17."""
+"""Access the local store's tables, of MLflow 3.17, if MLflow's client is too slow or lacks a call."""
 
 import math
 import shutil
@@ -32,7 +32,7 @@ _PLACES = (  # columns with absolute paths
 
 
 def forget_connections(root: Path) -> None:
-    """Close MLflow's connections to a database: they would keep using a file that was moved."""
+    """Close MLflow's connections to a database, which would keep using a moved file."""
     from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
 
     if (engine := SqlAlchemyStore._engine_map.pop(uri_of(root), None)) is not None:
@@ -40,14 +40,14 @@ def forget_connections(root: Path) -> None:
 
 
 def make_database(root: Path) -> None:
-    """Create the database of an outputs folder if it is missing, and let it be read while it is written."""
+    """Create the database of an outputs folder if it is missing, and allow reads during writes."""
     from mlflow import MlflowClient
 
     file = root / DATABASE
     if not file.exists():
-        for rest in ("-wal", "-shm"):  # of one that was removed: SQLite would play it into the new one
+        for rest in ("-wal", "-shm"):  # of a removed database: SQLite would replay it into the new one
             file.with_name(DATABASE + rest).unlink(missing_ok=True)
-        # MLflow does not recover from a process that dies while it creates the tables: create them aside.
+        # MLflow does not recover if a process dies while it creates the tables: create them aside.
         aside = root / "mlflow.aside"
         shutil.rmtree(aside, ignore_errors=True)
         aside.mkdir()
@@ -71,7 +71,7 @@ def artifacts(root: Path, experiment: str) -> Path:
 
 
 def follow(root: Path) -> str | None:
-    """Update the paths in the database if its outputs folder was moved or copied; return the old folder."""
+    """Update the paths in the database after its outputs folder was moved or copied; return the old folder."""
     moved = None
     with closing(sqlite3.connect(root / DATABASE)) as database, database:
         for name, location in database.execute("SELECT name, artifact_location FROM experiments").fetchall():
@@ -90,7 +90,7 @@ def follow(root: Path) -> str | None:
 
 
 def log_points(root: Path, run_id: str, points: Sequence[Point]) -> None:
-    """Add points to a run, each once however often it is sent; a hundred times as fast as MLflow's client."""
+    """Add points to a run, each once even if sent again; a hundred times as fast as MLflow's client."""
     rows = [
         (key, 0.0 if math.isnan(value) else value, time, step, math.isnan(value), run_id)
         for key, value, time, step in points

@@ -1,7 +1,7 @@
 """Send a run folder's journal to MLflow.
 
-Sending may be repeated, and is visible once: the store drops a point that it has (same key, step, time and value),
-files replace themselves by name, runs and models are looked up before they are made.
+Sending again changes nothing: the store drops a known point (same key, step, time and value), files replace themselves
+by name, and runs and models are looked up before they are created.
 """
 
 import io
@@ -42,29 +42,29 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 PRIMARY = "published.json"
-"""The file of a run folder with its cursor in the store of its own sessions."""
+"""A run folder's file with its cursor in the store of its own sessions."""
 PLACE = r"([a-z]+)/[A-Za-z0-9][A-Za-z0-9_.,~+=@-]{0,199}"
 """A run folder's place in an outputs folder."""
-_PARENT = rf"\.\./\.\./{PLACE}"  # as a run folder names its parent
+_PARENT = rf"\.\./\.\./{PLACE}"  # a run folder's path to its parent
 
-_POINTS = 5_000  # to be sent together: fewer cost more each
+_POINTS = 5_000  # a batch: smaller ones cost more a point
 _PIXELS = 4_096  # a side, of a picture: a file of some kilobytes can unpack to gigabytes
 _PARAM_LENGTH = 6_000  # characters that MLflow keeps
 
 
 @dataclass(frozen=True)
 class Cursor:
-    """How far a folder is published, where to, and as which run."""
+    """A folder's store, run and published offset."""
 
     store: str
     identity: str
     run_id: str = ""
     offset: int = 0
-    commit: str = ""  # the `digest` of the last commit that is published in full
+    commit: str = ""  # the `digest` of the last fully published commit
 
     @classmethod
     def read(cls, note: Path) -> "Cursor | None":
-        """Read a cursor; None also if it is damaged, since sending all again is harmless."""
+        """Read a cursor; return None if it is missing or damaged, since sending all again is harmless."""
         try:
             return schema_of(cls).validate_json(read_file(note, SMALL), strict=True)
         except (FileNotFoundError, ValueError):
@@ -77,21 +77,20 @@ class Cursor:
 def publish(folder: Path, store: Store, is_primary: bool = True, listed: Collection[str] | None = None) -> bool:
     """Bring the MLflow run of a folder up to the folder's last commit; return whether it was behind.
 
-    May be repeated, interrupted, and run by several processes at once. The cursor is kept in the folder; without it
-    everything is sent again, in order. A run that has not started is skipped. Infinite values are left out (MLflow
-    would show 1.8e308), NaN is kept. A missing file is skipped with a warning. A param that changes becomes a tag:
-    MLflow's params are final.
+    Safe to repeat, to interrupt, and to call from several processes at once. Without the folder's cursor it sends
+    everything again, in order. It skips a run that has not started and, with a warning, a missing file. It leaves out
+    infinite values (MLflow would show 1.8e308) and keeps NaN. A changed param becomes a tag: MLflow's params are final.
 
     Args:
-        is_primary: makes this the store that `unfinished` asks for; False leaves that to another one, if any.
-        listed: the ids of the store's runs, if known; a folder whose run is not among them is sent anew.
+        is_primary: makes this the store of `unfinished`; False leaves that to another one, if any.
+        listed: the ids of the store's runs, if known; a folder whose run is not among them is sent again.
 
     Raises:
         ValueError: the journal is damaged, or the folder is a link.
         MlflowException, OSError, sqlite3.Error: MLflow cannot be reached; a later call sends the rest.
     """
     if folder.is_symlink():
-        raise ValueError(f"{folder} is a link, which is not written through")
+        raise ValueError(f"{folder} is a link; replace it by a copy of its target")
     folder = folder.resolve()
     note = _note(folder, store, is_primary)
     with alone(note.with_suffix(".lock")):
@@ -105,7 +104,7 @@ def publish(folder: Path, store: Store, is_primary: bool = True, listed: Collect
                 return True
             except ValueError:
                 if read_commit(folder) == commit:
-                    raise  # else its writer began anew while it was read
+                    raise  # else its writer started over meanwhile
     return False
 
 
@@ -119,7 +118,7 @@ def _publish(folder: Path, store: Store, commit: Commit, note: Path, cursor: Cur
             cursor = replace(cursor, offset=offset)
             cursor.save(note)
     if mirror.gone:
-        _log.warning("%s: %d files are gone and not published, such as %s", folder, len(mirror.gone), mirror.gone[0])
+        _log.warning("%s: %d files are missing and not published, such as %s", folder, len(mirror.gone), mirror.gone[0])
     mirror.send_state(commit, _parent_run(folder, store, commit, is_primary))
     replace(cursor, offset=commit.offset, commit=digest(commit)).save(note)
 
@@ -142,7 +141,7 @@ def _note(folder: Path, store: Store, is_primary: bool) -> Path:
 
 
 def _opened(cursor: Cursor | None, note: Path, folder: Path, store: Store, commit: Commit) -> "tuple[Cursor, Run]":
-    """Return a folder's cursor in a store and its run; a new cursor is at the start of a found or new run."""
+    """Return a folder's cursor in a store and its run; if needed, create the run, and a cursor at its start."""
     run = store.run(cursor.run_id) if cursor and cursor.store == store.address and cursor.run_id else None
     if cursor and run:
         if cursor.identity == commit.identity == run.data.tags.get(IDENTITY):
@@ -150,9 +149,9 @@ def _opened(cursor: Cursor | None, note: Path, folder: Path, store: Store, commi
         # A run of another folder is not ours: its cursor was copied or forged.
         is_own = (run.data.tags.get(IDENTITY), run.data.tags.get(FOLDER)) == (cursor.identity, str(folder))
         if is_own and cursor.identity != commit.identity:
-            store.delete_run(cursor.run_id)  # it shows lines that the journal has taken back
+            store.delete_run(cursor.run_id)  # it shows lines that the journal no longer has
     cursor = Cursor(store.address, commit.identity)
-    cursor.save(note)  # for `unfinished`, if MLflow is out of reach
+    cursor.save(note)  # for `unfinished`, if MLflow is unreachable
     run = store.open_run(folder, commit)
     cursor = replace(cursor, run_id=run.info.run_id)
     cursor.save(note)
@@ -160,7 +159,7 @@ def _opened(cursor: Cursor | None, note: Path, folder: Path, store: Store, commi
 
 
 def _parent_run(folder: Path, store: Store, commit: Commit, is_primary: bool) -> str | None:
-    """Publish a folder's parent if need be, and return its run."""
+    """Publish a folder's parent if needed, and return its run."""
     _check_parents(folder, commit.parent)
     parent = Path(os.path.normpath(folder / commit.parent))
     if not re.fullmatch(_PARENT, commit.parent) or parent.is_symlink() or not parent.exists():
@@ -171,7 +170,7 @@ def _parent_run(folder: Path, store: Store, commit: Commit, is_primary: bool) ->
 
 
 def _check_parents(folder: Path, parent: str) -> None:
-    """Raise ValueError for a circle of parents."""
+    """Raise ValueError if the parents form a cycle."""
     places = [Path(os.path.normpath(folder))]
     while re.fullmatch(_PARENT, parent):
         place = Path(os.path.normpath(places[-1] / parent))
@@ -183,7 +182,7 @@ def _check_parents(folder: Path, parent: str) -> None:
 
 
 class _Mirror:
-    """Sends records of one folder to one run; every method may be repeated. Points and tags wait for `flush`."""
+    """Send records of one folder to one run; every method may be repeated. Points and tags wait for `flush`."""
 
     def __init__(self, folder: Path, store: Store, run: "Run") -> None:
         self._folder = folder
@@ -241,7 +240,7 @@ class _Mirror:
                     self._send_model(record, content)
 
     def _content(self, record: Artifact | Image | Model) -> bytes | None:
-        """Return the file that a record names, None if it is missing or has another checksum."""
+        """Return the content of a record's file, or None if it is missing or has another checksum."""
         file = self._folder / "artifacts" / record.path
         if not file.is_file():
             self.gone.append(record.path)
@@ -249,7 +248,7 @@ class _Mirror:
         content = read_file(file, ARTIFACT)
         if isinstance(record, Image) or is_whole(content, record.sha256):
             return content
-        if isinstance(record, Model):  # another file is newer than this record, and has its own
+        if isinstance(record, Model):  # any other file has a newer record of its own
             _log.warning("%s has changed since it was recorded and is not published", file)
         return None
 
@@ -263,12 +262,12 @@ class _Mirror:
         self._tags |= {key: value for key, value in values.items() if self._final[key] != value}
 
     def _send_image(self, record: Image, content: bytes) -> None:
-        # Named as MLflow's pages expect, where `log_image` would give an image sent again another name.
+        # Named as MLflow's pages expect; `log_image` would give an image sent again another name.
         unique = uuid5(UUID(self._run_id), record.path)
         name = f"images/{record.key.replace('/', '~')}+step+{record.step}+timestamp+{record.time}+{unique}"
         try:
             small = _shrunk(content)
-        except Exception as error:  # PIL raises anything
+        except Exception as error:  # PIL raises all kinds
             raise ValueError(f"{self._folder / 'artifacts' / record.path} is not a PNG of a run: {error}") from None
         self._store.put(self._run_id, f"{name}.png", content)
         self._store.put(self._run_id, f"{name}+compressed.webp", small)
@@ -304,7 +303,7 @@ def _points(record: Metrics | Model) -> list[Point]:
 
 
 def _shrunk(content: bytes) -> bytes:
-    """Return a PNG as a WebP of the size of MLflow's previews."""
+    """Convert a PNG to a WebP of the size of MLflow's previews."""
     from mlflow.tracking.multimedia import compress_image_size
     from PIL.PngImagePlugin import PngImageFile
 

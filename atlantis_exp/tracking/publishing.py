@@ -22,13 +22,13 @@ from atlantis_exp.tracking.store import Store, first_line
 
 _log = logging.getLogger(__name__)
 
-_DRAIN_SECONDS = 20.0  # that a command waits for MLflow at its end; `catch_up` sends the rest later
+_DRAIN_SECONDS = 20.0  # to wait for MLflow at a command's end; `catch_up` sends the rest later
 
 
 class Publisher:
-    """A thread that publishes the commits of run folders every `interval` seconds, and never disturbs the runs.
+    """Publish the commits of run folders every `interval` seconds in a thread, without disturbing the runs.
 
-    While MLflow fails it tries less and less often, down to once a minute.
+    While MLflow fails, it backs off to one try a minute.
     """
 
     def __init__(self, folder: Path, store: Store, interval: float = 5.0, others: Sequence[Path] = ()) -> None:
@@ -48,7 +48,7 @@ class Publisher:
     def _run(self) -> None:
         delay, failing, told = self._interval, False, set[Path]()
         while True:
-            draining = self._draining.is_set()  # read first: commits before a drain are published by it
+            draining = self._draining.is_set()  # read first: a drain publishes all commits before it
             fault: Exception | None = None  # of the store; a folder's own fault does not stop the others
             for folder in self._folders:
                 try:
@@ -63,7 +63,7 @@ class Publisher:
             if fault is not None:
                 if not failing:
                     reason = first_line(fault)
-                    _log.warning("Publishing to MLflow fails (%s); the run goes on and is published later", reason)
+                    _log.warning("Publishing to MLflow fails (%s); the run continues and is published later", reason)
                 delay, failing = min(2 * delay, 60.0), True
             else:
                 if failing:
@@ -86,10 +86,10 @@ def publishing(
     others: Sequence[RunFolder] = (),
     seconds: float = _DRAIN_SECONDS,
 ) -> Iterator[Journal]:
-    """Open a journal in the run's folder and mirror it to MLflow while it grows, unless tracking=none.
+    """Open a journal in the run's folder and mirror it to MLflow as it grows, unless tracking=none.
 
-    labels: tags that the run has from the start.
-    others: runs of other processes, mirrored too.
+    labels: tags of the run from its start.
+    others: runs of other processes to mirror, too.
     seconds: to wait for MLflow at the end.
 
     Raises:
@@ -107,11 +107,11 @@ def publishing(
         with terminal.working("publishing to MLflow"):
             is_sent = publisher.drain(seconds)
         if not is_sent:
-            terminal.warn(f"MLflow has not taken all of {folder.name} yet; the run's folder has it")
+            terminal.warn(f"MLflow has not received all of {folder.name} yet; the run's folder has it")
 
 
 def unfinished(folder: Path, root: Path) -> Store | None:
-    """Return the store, with its files under `root`, that lacks committed parts of a published folder."""
+    """Return the store, with its files under `root`, that lacks commits of a published folder."""
     cursor, commit = Cursor.read(folder / PRIMARY), read_commit(folder)
     if cursor is None or commit is None or cursor.commit == digest(commit):
         return None
@@ -122,10 +122,10 @@ def unfinished(folder: Path, root: Path) -> Store | None:
 def catch_up(
     outputs: Path, server: str | None = None, continued: Path | None = None, seconds: float = _DRAIN_SECONDS
 ) -> None:
-    """Mark runs whose process died as interrupted; publish the rest of earlier commands, each for some seconds.
+    """Mark runs of dead processes as interrupted; publish the rest of earlier commands, each for some seconds.
 
-    A folder may name any server, which would be sent the user's password: only the command's own `server` is used, and
-    the one in MLFLOW_TRACKING_URI. The run in the folder `continued` is left to its own session.
+    Use only the command's own `server` and the one in MLFLOW_TRACKING_URI: a folder may name any server, and that would
+    receive the user's password. Leave the run in the folder `continued` to its own session.
     """
     named = {server, os.environ.get("MLFLOW_TRACKING_URI")}
     left: Counter[str] = Counter()
@@ -136,11 +136,11 @@ def catch_up(
                 with suppress(Fault, OSError), folder.held():  # another user's folder may be read-only
                     if folder.status == "RUNNING":  # it may just have ended
                         Journal(folder.path).status("KILLED")
-                        print(f"run {folder.name} was killed; the command that started it continues it")
+                        print(f"run {folder.name} was killed; repeat its command to continue it")
             is_sent = folder.status == "RUNNING" or folder.path == continued
             store = None if is_sent else unfinished(folder.path, outputs)
         except (Fault, OSError, ValueError) as error:
-            terminal.warn(str(error))  # but do not refuse a command for another run
+            terminal.warn(str(error))  # a command must not fail because of another run
             continue
         if store is None or store.address in unreachable:
             continue
@@ -155,7 +155,7 @@ def catch_up(
 
 
 def lacking(outputs: Path) -> list[RunFolder]:
-    """Return the folders that were never published in the local store, all if it is missing."""
+    """Return the folders never published to the local store; all if it is missing."""
     folders = [folder for folder in all_folders(outputs) if (folder.path / "journal.jsonl").exists()]
     if not (outputs / DATABASE).exists():
         return folders
@@ -164,7 +164,7 @@ def lacking(outputs: Path) -> list[RunFolder]:
 
 
 def how_to_open(outputs: Path) -> str:
-    """Return a paragraph with the command that opens the UI on an outputs folder, empty if it has no runs."""
+    """Return a paragraph with the command that opens the UI on an outputs folder; empty without runs."""
     missing = len(lacking(outputs))
     if not missing and not (outputs / DATABASE).exists():
         return ""

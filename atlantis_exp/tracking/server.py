@@ -1,4 +1,4 @@
-"""Time limits on the calls of an MLflow server."""
+"""Limit the time of calls to an MLflow server."""
 
 import os
 import signal
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-_PIECE = 2**16  # bytes of a sent file for which a call gets a second more
+_PIECE = 2**16  # bytes of a sent file that give a call a second more
 
 
 class TooSlow(Exception):
@@ -36,14 +36,14 @@ class PatientClient:
 
 @contextmanager
 def _patience(seconds: int) -> Iterator[None]:
-    """Raise TooSlow if the block takes longer; in the main thread only, as only there a signal can end a wait."""
+    """Raise TooSlow if the block takes longer, in the main thread, where alone a signal can end a wait."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     late: list[TooSlow] = []
 
     def give_up(*_: object) -> None:
-        late.append(TooSlow(f"the server has not answered in full within {seconds} seconds"))
+        late.append(TooSlow(f"the server did not answer in full within {seconds} seconds"))
         raise late[0]
 
     before = signal.signal(signal.SIGALRM, give_up)

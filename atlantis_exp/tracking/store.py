@@ -1,4 +1,4 @@
-"""One experiment of MLflow: a database and files in an outputs folder, or a server."""
+"""Open an MLflow experiment: a database and files in an outputs folder, or a server."""
 
 import logging
 import os
@@ -30,18 +30,18 @@ P = TypeVar("P")
 _log = logging.getLogger(__name__)
 
 IDENTITY, FOLDER, RUN_NAME = "atlantis.identity", "atlantis.folder", "mlflow.runName"
-"""Tags of a run: its identity, the folder that it was published from, and its name."""
+"""Tags of a run: its identity, its folder, and its name."""
 
 _PAGES = 1_000  # of 1,000 runs each, that a server may list
-_NAME_LENGTH = 250  # characters of a run's name that a PostgreSQL store takes
+_NAME_LENGTH = 250  # characters of a run's name in a PostgreSQL store
 _UNUSABLE = ("not a database", "is malformed", "out-of-date database schema", "Can't locate revision")
 
 
 class Store:
-    """One experiment of an MLflow database under `root`, a folder on a local disk, or of the server at `tracking_uri`.
+    """An experiment of the MLflow database in `root`, a folder on a local disk, or of the server at `tracking_uri`.
 
-    MLflow is imported (1-3 s) and its tables are made on first use, by any number of processes at once. patience:
-    seconds that a call of a server may take.
+    Imports MLflow (1-3 s) and creates its tables on first use, in any number of processes at once. A call to a server
+    may take `patience` seconds.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class Store:
 
     @property
     def experiment_id(self) -> str:
-        """The id of the experiment, which is made if need be."""
+        """The id of the experiment, created if needed."""
         return self._connection[1]
 
     @property
@@ -68,7 +68,7 @@ class Store:
         return f"{self.uri}#{self._experiment}"
 
     def runs(self, name: str | None = None) -> "list[Run]":
-        """Return the published runs, the latest first; with a name, those of that name."""
+        """Return the published runs, the latest first; with a name, only those of that name."""
         published = f"tags.`{FOLDER}` != ''"
         wanted = published if name is None else f'{published} AND attributes.run_name = "{name}"'
         return all_pages(partial(self.client.search_runs, [self.experiment_id], wanted))
@@ -86,7 +86,7 @@ class Store:
             self.client.set_experiment_tag(self.experiment_id, key, value)
 
     def open_run(self, folder: Path, commit: Commit) -> "Run":
-        """Return the run that mirrors a folder; create it if it is missing."""
+        """Return the run that mirrors a folder; create a missing one."""
         same = f"tags.`{IDENTITY}` = '{commit.identity}'"
         if found := self.client.search_runs([self.experiment_id], same, max_results=1):
             return found[0]
@@ -95,7 +95,7 @@ class Store:
         return self.client.create_run(self.experiment_id, commit.started, tags, labels.get(RUN_NAME, folder.name))
 
     def run(self, run_id: str) -> "Run | None":
-        """Return a run, None if it is missing or deleted."""
+        """Return a run, or None if it is missing or deleted."""
         from mlflow.exceptions import MlflowException
 
         try:
@@ -107,14 +107,14 @@ class Store:
         return run if run.info.lifecycle_stage == "active" else None
 
     def delete_run(self, run_id: str) -> None:
-        """Delete a run and its models, which MLflow would keep."""
+        """Delete a run, and its models, which MLflow would keep."""
         for model in self.models(run_id):
             self.client.delete_logged_model(model.model_id)
         self.client.delete_run(run_id)
 
     def put(self, run_id: str, path: str, content: bytes, model_id: str = "") -> None:
         """Add a file to a run or to a model."""
-        if self.is_local:  # MLflow's client would ask the database for each
+        if self.is_local:  # MLflow's client would query the database for each file
             owner = f"models/{model_id}" if model_id else run_id
             place = local.artifacts(self._root, self._experiment) / owner / "artifacts" / path
             place.parent.mkdir(parents=True, exist_ok=True)
@@ -130,7 +130,7 @@ class Store:
                 self.client.log_artifact(run_id, str(file), os.path.dirname(path))
 
     def log_points(self, run_id: str, points: Sequence[Point]) -> None:
-        """Add points to a run, each once however often it is sent."""
+        """Add points to a run, each once even if sent again."""
         if self.is_local:
             local.log_points(self._root, run_id, points)
             return
@@ -139,7 +139,7 @@ class Store:
         self.client.log_batch(run_id, metrics=[Metric(*point) for point in points], synchronous=True)
 
     def fault(self, error: Exception) -> Fault | None:
-        """Return the store's fault after an error, None if it answers and the published folder is the cause."""
+        """Return the store's fault after an error, or None if the published folder is the cause."""
         if isinstance(error, ValueError):  # raised for a folder's own files
             return None
         is_busy = getattr(error, "error_code", "") == "TEMPORARILY_UNAVAILABLE"
@@ -152,14 +152,14 @@ class Store:
         return None
 
     def explained(self, error: Exception) -> Fault:
-        """Return an error of the store with its remedy."""
+        """Turn a store's error into a fault with its remedy."""
         if isinstance(error, Fault):
             return error
         reason = first_line(error)
         if not self._is_unusable(error):
             return Fault(f"{self.uri} cannot be reached: {reason}")
         again = f"{PROGRAM} sync {quote(f'paths.outputs={self._root}')}"
-        return Fault(f"{self._root / DATABASE} cannot be used ({reason}): move it away, and {again} makes it again")
+        return Fault(f"{self._root / DATABASE} cannot be used ({reason}): move it away, and {again} rebuilds it")
 
     def _is_unusable(self, error: Exception) -> bool:
         return self.is_local and any(reason in str(error) for reason in _UNUSABLE)
@@ -171,11 +171,11 @@ class Store:
         os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")  # seconds
         os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
         os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
-        # Files would go to whatever address the server names.
+        # Else files would go to any address that the server names.
         os.environ.setdefault("MLFLOW_ENABLE_PROXY_MULTIPART_UPLOAD", "false")
         from mlflow import MlflowClient
 
-        # MLflow's failures reach us as exceptions; its log would add a traceback to each.
+        # MLflow's failures reach us as exceptions; its log would add tracebacks.
         logging.getLogger("mlflow").setLevel(logging.CRITICAL)
         logging.getLogger("alembic").setLevel(logging.WARNING)
         with alone(self._root / "mlflow.lock"):  # processes that create the tables together would break them
@@ -187,14 +187,14 @@ class Store:
                 client = MlflowClient(local.uri_of(self._root))
                 client.search_experiments(max_results=1)  # MLflow checks the version of the tables
                 if before := local.follow(self._root):
-                    _log.warning("%s was moved or copied from %s: its MLflow store follows", self._root, before)
+                    _log.warning("%s was moved or copied from %s: corrected the paths in its store", self._root, before)
                 return client, self._opened_experiment(client)
             except Exception as error:
                 local.forget_connections(self._root)
                 raise self.explained(error) from None
 
     def _opened_experiment(self, client: "MlflowClient") -> str:
-        """Return the id of the experiment; create it if it is missing, restore it if it was deleted."""
+        """Return the id of the experiment; create a missing one, restore a deleted one."""
         if (experiment := client.get_experiment_by_name(self._experiment)) is None:
             # MLflow's default depends on the working directory of the first process.
             location = local.artifacts(self._root, self._experiment).as_uri() if self.is_local else None
@@ -202,15 +202,15 @@ class Store:
                 return client.create_experiment(self._experiment, location)
             except Exception:
                 if (experiment := client.get_experiment_by_name(self._experiment)) is None:
-                    raise  # else another machine was faster
+                    raise  # else another machine has created it
         if experiment.lifecycle_stage == "deleted":
             client.restore_experiment(experiment.experiment_id)
-            _log.warning("The MLflow experiment %s had been deleted: it is restored, with its runs", self._experiment)
+            _log.warning("Restored the deleted MLflow experiment %s with its runs", self._experiment)
         return experiment.experiment_id
 
 
 def labels_of(commit: Commit) -> dict[str, str]:
-    """Return a run's labels, its name cut to the length that a store takes."""
+    """Return a run's labels, with its name cut to a store's limit."""
     return {key: text[:_NAME_LENGTH] if key == RUN_NAME else text for key, text in commit.labels.items()}
 
 

@@ -28,31 +28,31 @@ _COLUMNS = (
 )
 
 START, SWEEP, COMPARISONS = "start", "sweep", "comparisons"
-"""The keys of the shared views, as `viewStateShareKey` in an address takes them."""
+"""The keys of the shared views, for `viewStateShareKey` in an address."""
 
 _APART = ("training sweep", "search", "decision", "comparison", "evaluation")
-"""Kinds of runs without a curve, and those of players from elsewhere, beside whose scores no bar would be seen."""
+"""Kinds of runs without a curve, and external players, whose scores would dwarf every bar."""
 
 _ABOUT = """\
 **Does network B play better than network A, and how sure is that?**
 
-- Three views are prepared (share key in the address): **Start here** has a line a training, the best evaluation first;
-  **Sweep** has a line a group of runs that differ only in their seed: their mean, with its range; **Comparisons** has
-  a line a comparison, the newest first, with its verdict.
-- A run's name says what differs from the defaults: network, samplers, seed, then the rest. Blues are DQNCnn, reds
-  ResNetDQN, paler ones sample otherwise than uniformly; grey is the random player.
-- `score/` is the training's own play, with the exploration that `actions/epsilon` shows. `evaluation/` is what counts:
-  episodes at a small fixed epsilon, on emulators of their own.
+- There are three views (share key in the address): **Start here** has a line a training, the best evaluation first;
+  **Sweep** has a line a group of runs that differ only in their seed, with their mean and range; **Comparisons** has a
+  line a comparison, the newest first, with its verdict.
+- A run's name lists its network, samplers and seed, then other differences from the defaults. Blues are DQNCnn, reds
+  ResNetDQN, paler for samplers other than uniform; grey is the random player.
+- `score/` is the training's own play, with the exploration in `actions/epsilon`. `evaluation/` decides: episodes at a
+  small fixed epsilon, on separate emulators.
 - Under `pictures`, the slider counts windows of the training (histogram of the window, heat map of all up to it) and
-  evaluations, from 0: at each position the runs stand side by side.
-- A run's page: its description has the result and how to continue it; *Artifacts* has `best_episode.mp4`,
-  `episodes.csv` and every evaluation's table. *Models* lists the weights of each evaluation; `best` marks the best.
-- A sweep is a run, too: the table of its runs is on its page.
+  evaluations, from 0: each position shows the runs side by side.
+- The description on a run's page has the result and how to continue it; *Artifacts* has `best_episode.mp4`,
+  `episodes.csv` and every evaluation's table; *Models* has the weights of each evaluation, with `best` on the best.
+- A sweep is a run, too, whose page has the table of its runs.
 """
 
 
 def experiment_tags(newest: str | None) -> dict[str, str]:
-    """Return an experiment's tags: description and views; newest: a link to its newest comparison."""
+    """Return an experiment's tags: description and views. newest: a link to its newest comparison."""
     note = f"{_ABOUT}- The newest comparison: {newest}\n" if newest else _ABOUT
     tags = {NOTE: note, "mlflow.experimentKind": "custom_model_development"}
     views = {
@@ -77,8 +77,8 @@ def address(server: str, experiment_id: str, view: str) -> str:
 
 
 def site(outputs: Path, start: str) -> Any:
-    """Return MLflow's server on the store of an outputs folder, whose plain address leads to `start`."""
-    os.environ["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] = "false"  # ten processes otherwise
+    """Return MLflow's server on the store of an outputs folder, which redirects its plain address to `start`."""
+    os.environ["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] = "false"  # else it starts ten processes
     os.environ["_MLFLOW_SERVER_FILE_STORE"] = uri_of(outputs.resolve())  # read by the import: this is a server
     from mlflow.server import app as pages
 
@@ -86,7 +86,7 @@ def site(outputs: Path, start: str) -> Any:
         from mlflow.server.fastapi_app import app
     from starlette.responses import Response
 
-    # Browsers do not send the part after '#' to a server: the page itself has to look.
+    # Browsers do not send the part after '#' to a server, so the page must check it.
     lead = (
         f"<head><script>if (!location.hash) location.replace({json.dumps(start)});"
         "localStorage.setItem('mlflow.assistant.fab.autoOpenedOnFirstLoad_v1', 'true')</script>"
@@ -95,7 +95,7 @@ def site(outputs: Path, start: str) -> Any:
     pages.view_functions["serve"] = lambda: index
 
     async def without_assistant(scope: Any, receive: Any, send: Any) -> None:
-        """Leave out MLflow's assistant, which can run a shell and open an agent on this machine."""
+        """Disable MLflow's assistant, which can run a shell and open an agent on this machine."""
         is_assistants = "/mlflow/assistant" in scope.get("path", "")
         await (Response(status_code=404) if is_assistants else app)(scope, receive, send)
 
@@ -161,7 +161,7 @@ def _page(view: str, charts: list[dict[str, Any]]) -> dict[str, Any]:
         {"uuid": name, "name": name, "columns": columns, "cardHeight": height, **shown}
         for name, (columns, height) in _SECTIONS.items()
     ]
-    # A picture that no chart shows alone would get one that does; a deleted one prevents it.
+    # MLflow adds a chart for a picture that has none of its own; a deleted one prevents it.
     covered = {key for chart in charts for key in chart.get("imageKeys", [])}
     charts = [*charts, *({**_images("pictures", key), "deleted": True} for key in sorted(covered))]
     return {

@@ -1,4 +1,4 @@
-"""Players: who chooses the next action, and from what."""
+"""Choose the next action: players."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,16 +20,16 @@ class Decisions(NamedTuple):
 
 
 class Actor(Protocol):
-    """Chooses an action for each of B states; state b draws from the b-th generator only."""
+    """Choose an action for each of B states; state b draws only from the b-th generator."""
 
     def act(self, states: States, epsilon: float, generators: Generators) -> Decisions: ...
 
 
 @dataclass(frozen=True)
 class EpsilonGreedy:
-    """The network's best action, or with probability epsilon any action (report figure 3.2).
+    """Choose the network's best action, or any action with probability epsilon (report figure 3.2).
 
-    Chance decides before the network is asked, unless `watches`: then the decisions hold its values of all states.
+    Random decisions skip the network, unless `watches`: then the decisions hold its values of all states.
     """
 
     q_values: Callable[[States], npt.NDArray[np.float32]]
@@ -52,7 +52,7 @@ class EpsilonGreedy:
 
 @dataclass(frozen=True)
 class RandomActor:
-    """Any action, whatever epsilon says (report figure 1.4)."""
+    """Choose any action, whatever epsilon is (report figure 1.4)."""
 
     num_actions: int
 
@@ -63,7 +63,7 @@ class RandomActor:
 
 @dataclass(frozen=True)
 class PersonActor:
-    """A person who `choose`s an action at the sight of the one emulator's screen, (210, 160, 3) uint8."""
+    """Let a person `choose` an action from the screen of a single emulator, (210, 160, 3) uint8."""
 
     screen: Callable[[], npt.NDArray[np.uint8]]
     choose: Callable[[npt.NDArray[np.uint8]], int]
@@ -74,7 +74,7 @@ class PersonActor:
 
 @dataclass(frozen=True)
 class ConstantActor:
-    """Always the same action, whatever epsilon says."""
+    """Choose always the same action, whatever epsilon is."""
 
     action: int
 

@@ -1,4 +1,4 @@
-"""Checkpoints: the state of a whole training, written so that a crash at any moment leaves the last whole one."""
+"""Save the state of a whole training so that a crash at any moment leaves a whole checkpoint."""
 
 import errno
 import hashlib
@@ -22,29 +22,29 @@ from atlantis_exp.runs.files import CHECKPOINT, SMALL, inside, read_file, read_o
 FORMAT = 1
 _SEGMENTS = 64  # of a full memory, about
 _DAMAGED = (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, SafetensorError)
-"""Errors of reading a state that is not the one saved."""
+"""Errors of reading a damaged state."""
 _FOR_GOOD = {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENXIO, errno.EIO}
-"""Errors of a file that is lost; others may pass, as those of a file server."""
+"""Errors of a lost file; others may pass, as those of a file server."""
 
 
 class CheckpointError(Fault):
-    """No checkpoint can be continued from, although there is one."""
+    """No checkpoint of a training can be used."""
 
 
 @contextmanager
 def unforged(folder: Path) -> Iterator[None]:
-    """Raise CheckpointError if the block, which takes a state apart, finds another state than was saved."""
+    """Raise CheckpointError if the block, which loads a state, finds damage."""
     try:
         yield
     except Fault:
         raise
     except (*_DAMAGED, MemoryError) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise CheckpointError(f"the checkpoint in {folder} is not of this training ({reason})") from None
+        raise CheckpointError(f"the checkpoint in {folder} does not fit this training ({reason})") from None
 
 
 def to_safetensors(tensors: Mapping[str, torch.Tensor]) -> bytes:
-    """Return tensors by name as safetensors, which refuses shared memory: tied weights are written twice."""
+    """Return tensors as safetensors, which refuses shared memory: write tied weights twice."""
     written: dict[str, torch.Tensor] = {}
     places: set[int] = set()
     for name, tensor in tensors.items():
@@ -55,12 +55,12 @@ def to_safetensors(tensors: Mapping[str, torch.Tensor]) -> bytes:
 
 
 class Checkpoints:
-    """Generations of a training's state under a folder; the two newest are kept.
+    """The two newest generations of a training's state in a folder.
 
     A generation is a folder with `state.json` (the tree, with a place for each array), `tensors.safetensors` and
-    `arrays.safetensors`. It counts once its `manifest.json` is in place, with the checksums of all files and its own.
+    `arrays.safetensors`. It counts once it has its `manifest.json`, with the checksums of all files and its own.
     Generations share the segments of the replay memory, which never change: a save adds the new observations, and
-    writes a small last segment again. `identity` names the experiment.
+    rewrites a small last segment. `identity` names the experiment.
     """
 
     def __init__(self, folder: Path, identity: str) -> None:
@@ -68,15 +68,15 @@ class Checkpoints:
         self.identity = identity
         self._segments: list[dict[str, Any]] = []  # of the memory, oldest first: name, since, next_id, sha256
         self._generation = 0
-        self.lost = 0  # observations missing from the loaded memory, at most
+        self.lost = 0  # at most so many observations are missing from the loaded memory
 
     def save(self, state: Mapping[str, Any], memory: ReplayMemory) -> None:
-        """Write a generation. Raises: OSError, with the generations before it intact."""
+        """Write a generation. Raises: OSError, with earlier generations intact."""
         segments = [entry for entry in self._segments if entry["next_id"] > memory.oldest_id]
         since = segments[-1]["next_id"] if segments else memory.oldest_id
         if memory.next_id > since:
             if segments and since - segments[-1]["since"] < memory.capacity // _SEGMENTS:
-                since = segments.pop()["since"]  # write it again: frequent saves would make tiny segments
+                since = segments.pop()["since"]  # rewrite it: frequent saves would make tiny segments
             name = f"segments/{since:012d}-{memory.next_id:012d}"
             checksums = self._write(name, memory.segment(since))
             segments.append({"name": name, "since": since, "next_id": memory.next_id, "sha256": checksums})
@@ -96,14 +96,14 @@ class Checkpoints:
     def load(
         self, memory: ReplayMemory | None = None, warn: Callable[[str], None] = lambda _: None
     ) -> dict[str, Any] | None:
-        """Return the newest whole generation's state, None if there is none; restore `memory` if given.
+        """Return the newest whole generation's state, or None; restore `memory` if given.
 
-        A damaged generation is skipped with a `warn`ing. If none has its whole memory, the newest goes on with the
-        observations after the last damaged segment, and `lost` counts the others.
+        Skips damaged generations with a `warn`ing. If none has its whole memory, returns the newest one with the
+        observations after its last damaged segment, and counts the others in `lost`.
 
         Raises:
             CheckpointError: all generations are damaged, the newest is of another experiment or a newer format, or a
-                file cannot be read now but may be whole. The files stay as they are.
+                file is temporarily unreadable. The files stay unchanged.
         """
         faults: list[str] = []
         state = self._load(memory, False, faults)
@@ -112,12 +112,12 @@ class Checkpoints:
         if state is not None or not faults:
             return state
         if memory is not None and (state := self._load(memory, True, [])) is not None:
-            warn(f"no checkpoint has its whole replay memory: {self.lost:,} observations are lost, the run goes on")
+            warn(f"no checkpoint has its whole replay memory: {self.lost:,} observations are lost, the run continues")
             return state
-        raise CheckpointError(f"{faults[0]}, and no older one is whole; resume=never keeps this run and begins anew")
+        raise CheckpointError(f"{faults[0]}, and no older one is whole; resume=never keeps this run and starts over")
 
     def _load(self, memory: ReplayMemory | None, may_lose: bool, faults: list[str]) -> dict[str, Any] | None:
-        """Return the newest state that can be read; append the faults of those that cannot."""
+        """Return the newest readable state; append the faults of others."""
         for generation in sorted(self._generations(), reverse=True):
             try:
                 manifest = read_object(self._content(f"{_name(generation)}/manifest.json", SMALL))
@@ -135,7 +135,7 @@ class Checkpoints:
             except CheckpointError:
                 raise
             except MemoryError:
-                raise self._not_now("this takes more memory than there is") from None
+                raise self._not_now("not enough memory") from None
             except _DAMAGED as error:
                 faults.append(f"checkpoint {generation} in {self.folder} is damaged ({error})")
                 continue
@@ -176,7 +176,7 @@ class Checkpoints:
         return [int(path.parent.name) for path in folders if path.parent.name.isdecimal()]
 
     def _write(self, name: str, tree: Mapping[str, Any]) -> dict[str, str]:
-        """Write a state tree as files of a new folder; return their checksums."""
+        """Write a state tree to files of a new folder; return their checksums."""
         tensors: dict[str, torch.Tensor] = {}
         arrays: dict[str, np.ndarray[Any, Any]] = {}
         files = {"state.json": json.dumps(_disassemble(tree, "", tensors, arrays)).encode()}
@@ -208,12 +208,12 @@ class Checkpoints:
 
     def _not_now(self, reason: str) -> CheckpointError:
         return CheckpointError(
-            f"the checkpoints in {self.folder} cannot be read now ({reason}), but may be whole; the same command tries "
-            f"again, resume=never keeps this run and begins anew"
+            f"the checkpoints in {self.folder} cannot be read now ({reason}), but may be whole; repeat the command, or "
+            f"add resume=never, which keeps this run and starts over"
         )
 
     def _clean(self, generation: int, segments: set[str]) -> None:
-        """Remove all generations but this one and the one before, and all segments but theirs."""
+        """Remove all but this generation, the previous one, and their segments."""
         for older in self._generations():
             if older < generation - 1:
                 shutil.rmtree(self.folder / _name(older), ignore_errors=True)
@@ -239,7 +239,7 @@ def _name(generation: int) -> str:
 def _disassemble(
     node: Any, path: str, tensors: dict[str, torch.Tensor], arrays: dict[str, np.ndarray[Any, Any]]
 ) -> Any:
-    """Return the tree with each tensor and array moved into its table, under its path."""
+    """Return the tree without its tensors and arrays, which move to the tables under their paths."""
     if isinstance(node, torch.Tensor):
         tensors[path] = node
         return {"$tensor": path}

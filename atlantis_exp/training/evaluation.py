@@ -1,4 +1,4 @@
-"""Evaluation: episodes at a fixed epsilon, on their own emulators and random streams (report figure 3.3)."""
+"""Play episodes at a fixed epsilon, on their own emulators and random streams (report figure 3.3)."""
 
 from array import array
 from collections import deque
@@ -16,16 +16,16 @@ from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.statistics import Summary, summarize
 from atlantis_exp.training.actor import Actor, Decisions
 
-_COLLAPSED = 0.99  # share of the network's decisions that are one action
+_COLLAPSED = 0.99  # share of one action in the network's decisions
 
 
 class Stopped(Exception):
-    """An evaluation was asked to stop; nothing of it is kept."""
+    """An evaluation stopped on request; nothing of it is kept."""
 
 
 @dataclass
 class Episode:
-    """One evaluated episode; its seed and actions are all that is needed to see it again."""
+    """One evaluated episode; its seed and actions suffice to play it again."""
 
     seed: int
     score: float = 0.0
@@ -49,7 +49,7 @@ class Episode:
 
     @property
     def random_share(self) -> float:
-        """Share of the decisions that chance took."""
+        """Share of random decisions."""
         return sum(self.random) / self.steps
 
     def action_counts(self, num_actions: int) -> npt.NDArray[np.int64]:
@@ -73,7 +73,7 @@ class Evaluation:
 
     @property
     def best(self) -> Episode:
-        """The first of the episodes with the highest score."""
+        """The first episode with the highest score."""
         return max(self.episodes, key=lambda episode: episode.score)
 
     @cached_property
@@ -89,7 +89,7 @@ class Evaluation:
 
     @property
     def random_share(self) -> float:
-        """Share of all decisions that chance took."""
+        """Share of random decisions in all episodes."""
         return float(self.action_counts[:, 1].sum() / self.action_counts.sum())
 
     @property
@@ -105,13 +105,13 @@ class Evaluation:
 
     @property
     def favourite(self) -> tuple[str, float]:
-        """The action that the network chose most often, and its share of the network's decisions; 0 if it had none."""
+        """The network's most frequent action, and its share of the network's decisions; 0 without any."""
         chosen = self.action_counts[:, 0]
         return self.game.actions[int(chosen.argmax())], int(chosen.max()) / max(1, int(chosen.sum()))
 
     @property
     def collapsed(self) -> bool:
-        """Whether the network chooses one action only."""
+        """Whether the network always chooses one action."""
         return self.favourite[1] > _COLLAPSED
 
     @property
@@ -183,11 +183,10 @@ def evaluate(
     on_step: Callable[[Sequence[Episode]], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Evaluation:
-    """Play episodes side by side, each determined by `seed` and its index alone.
+    """Play episodes side by side; `seed` and its index alone determine each.
 
-    The environments are two halves: while one is emulated, the actor decides for the other. States have `stack`
-    observations of `size` x `size` pixels. on_step is called with all episodes after every step of a half, `stop`
-    before it.
+    While one half of the environments is emulated, the actor decides for the other. States have `stack` observations
+    of `size` x `size` pixels. Calls `stop` before every step of a half, and `on_step` with all episodes after it.
 
     Raises:
         Stopped: `stop` returned True.

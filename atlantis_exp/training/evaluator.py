@@ -1,4 +1,4 @@
-"""An evaluation protocol: emulators of its own, epsilon, seed, film."""
+"""Evaluate by a protocol: own emulators, epsilon, seed, film."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from atlantis_exp.training.progress import Progress
 
 @dataclass(frozen=True)
 class Evaluator:
-    """Evaluates any actor by one protocol, without touching a training that is under way."""
+    """Evaluate any actor by one protocol, without touching the training."""
 
     make_emulators: Callable[[int], Emulators]
     make_emulator: Callable[[], Emulator]
@@ -24,7 +24,7 @@ class Evaluator:
     size: int  # pixels
     stack: int  # observations
     most_frames: int  # an episode
-    video: Part | None  # the part of the best episode that is filmed
+    video: Part | None  # the part of the best episode to film
 
     def __call__(
         self,
@@ -34,7 +34,7 @@ class Evaluator:
         stop: Callable[[], bool] = lambda: False,
         emulators: Emulators | None = None,
     ) -> Evaluation:
-        """Play so many episodes on `emulators`, by default new ones. Raises: Stopped when `stop` returns True."""
+        """Play a number of episodes on `emulators`, by default new ones. Raises: Stopped when `stop` returns True."""
         with emulators or self.make_emulators(min(self.num_envs, episodes)) as emulators:
             return evaluate(
                 actor,
@@ -51,7 +51,7 @@ class Evaluator:
     def film(
         self, evaluation: Evaluation, progress: Progress, stop: Callable[[], bool] = lambda: False
     ) -> bytes | None:
-        """Return an mp4 of the best episode, None if none is wanted. Raises: Stopped; `stop` is asked every picture."""
+        """Return an mp4 of the best episode, or None if `video` is. Raises: Stopped; calls `stop` at every picture."""
         if self.video is None:
             return None
 

@@ -1,4 +1,4 @@
-"""Film an episode by playing it again, with each decision next to the screen."""
+"""Film an episode by playing it again, and show each decision next to the screen."""
 
 from collections.abc import Callable, Iterator
 from itertools import islice
@@ -17,7 +17,7 @@ FRAMES_A_MINUTE = 3_600  # of the game
 
 
 class Moment(NamedTuple):
-    """The screen before a step of an episode and the decision on it; None at the end."""
+    """The screen before a step of an episode, and the decision; None at the end."""
 
     screen: npt.NDArray[np.uint8]  # (210, 160, 3)
     score: float  # so far
@@ -28,7 +28,7 @@ class Moment(NamedTuple):
 
 
 def moments(episode: Episode, emulator: Emulator, start: int = 0) -> Iterator[Moment]:
-    """Play an episode again from its seed and actions; yield its moments from the step `start` on."""
+    """Play an episode again from its seed and actions; yield its moments from step `start` on."""
     emulator.reset(episode.seed)
     values = episode.values
     score, frame = 0.0, 0
@@ -43,7 +43,7 @@ def moments(episode: Episode, emulator: Emulator, start: int = 0) -> Iterator[Mo
 
 
 def span(episode: Episode, part: Part) -> tuple[int, int]:
-    """Return the first step of a part of an episode and the step after its last; a minute is an average one."""
+    """Return the first step of a part of an episode and the one after its last, by average steps a minute."""
     minute = round(FRAMES_A_MINUTE * episode.steps / episode.frames)
     if part == "all" or minute >= episode.steps:
         return 0, episode.steps
@@ -59,7 +59,7 @@ def film_episode(
 ) -> bytes:
     """Return an mp4 of a part of an episode at the game's speed: 60 frames a second, on average.
 
-    tell is called with the numbers of pictures drawn and in all.
+    Calls `tell` with the number of drawn pictures and of all.
     """
     chooser = "player" if episode.values is None else "network"
     start, end = span(episode, part)

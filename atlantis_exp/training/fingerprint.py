@@ -1,4 +1,4 @@
-"""Fingerprints: a hash for each part of a training, equal in two trainings that are the same."""
+"""Hash each part of a training, to compare two trainings."""
 
 import hashlib
 import json
@@ -17,7 +17,7 @@ WALL_CLOCK = ("throughput/steps_per_second", "throughput/hours")
 
 
 def fingerprint(state: Mapping[str, Any], memory: ReplayMemory, folder: Path) -> dict[str, str]:
-    """Hash a training's state, its replay memory and its committed history, without anything that depends on time."""
+    """Hash a training's state, replay memory and committed history, without all that depends on time."""
     parts = {name: part for name, part in state.items() if name not in ("learner", "tracker")}
     parts["counters"] = {name: count for name, count in state["counters"].items() if name != "seconds"}
     learner = dict(state["learner"])

@@ -1,4 +1,4 @@
-"""Forecast the time, memory and disk of a training, from a few seconds of measurement on this machine."""
+"""Forecast the time, memory and disk of a training from a few seconds of measurement."""
 
 import copy
 import math
@@ -15,16 +15,16 @@ from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.training.plan import Counters
 from atlantis_exp.training.trainer import Trainer
 
-_WARM_MEMORY = 512 * 2**20  # bytes that torch and its thread buffers grow by once they work
+_WARM_MEMORY = 512 * 2**20  # bytes by which torch and its thread buffers will grow
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """The costs of a training, and the memory and disk that are free."""
+    """The costs of a training, and the free memory and disk."""
 
     steps_per_second: float
     steps: int
-    memory: int  # bytes that the process will grow by
+    memory: int  # bytes by which the process will grow
     memory_available: int  # bytes
     disk: int  # bytes under the outputs folder
     disk_available: int  # bytes
@@ -46,11 +46,11 @@ class Forecast:
 
     @property
     def shortage(self) -> str | None:
-        """The resource that will not suffice and the remedy, None if all suffice."""
+        """The resource that will not suffice and the remedy, or None."""
         if self.held <= self.learn_start:
             return (
                 f"nothing would be learned: replay.max_bytes holds some {self.held:,.0f} observations, and learning "
-                f"begins after {self.learn_start:,}; raise replay.max_bytes or lower training.learn_start"
+                f"starts after {self.learn_start:,}; raise replay.max_bytes or lower training.learn_start"
             )
         if self.memory > self.memory_available:
             return (
@@ -69,7 +69,7 @@ def forecast(trainer: Trainer, *, capacity: int, max_bytes: int, size: int, stac
     """Time emulation, acting and learning with a trainer's parts, and restore all but the emulators.
 
     Call it before their episodes begin or are loaded. capacity in observations, max_bytes of the replay memory, size in
-    pixels. Episodes left are taken to be as long as those done, or as the game's usual ones.
+    pixels. Assumes that future episodes are as long as past ones, or as the game's usual ones.
     """
     plan, learner, emulators = trainer.plan, trainer.learner, trainer.emulators
     num_envs = emulators.num_envs
@@ -87,7 +87,7 @@ def forecast(trainer: Trainer, *, capacity: int, max_bytes: int, size: int, stac
             memory.add(env, int(actions[env]), float(steps.rewards[env]), steps.observations[env], False)
         ended = np.flatnonzero(steps.terminated | steps.truncated).tolist()
         for env, observation in zip(ended, emulators.reset(ended) if ended else (), strict=True):
-            memory.begin(env, observation)  # a game that is over would be measured otherwise
+            memory.begin(env, observation)  # else a finished game would be measured
 
     def update() -> None:
         ids, weights = sampler.sample(memory, plan.batch_size, rng)
@@ -98,7 +98,7 @@ def forecast(trainer: Trainer, *, capacity: int, max_bytes: int, size: int, stac
         states = np.zeros((num_envs, stack, size, size), np.uint8)
         act_seconds = _median_seconds(lambda: learner.q_values(states), at_least=3, seconds=0.5)
         update_seconds = _median_seconds(update, at_least=3, seconds=1.0)
-    emulators.reset(range(num_envs), [0] * num_envs)  # a console that has not played
+    emulators.reset(range(num_envs), [0] * num_envs)  # a fresh console
 
     usual = 1 if plan.unit == "steps" else emulators.game.episode_steps
     each = done.steps / plan.done(done) if plan.done(done) else usual
@@ -109,7 +109,7 @@ def forecast(trainer: Trainer, *, capacity: int, max_bytes: int, size: int, stac
     steps = max(1, (length if trainer.last_step is None else min(length, trainer.last_step)) - done.steps)
     an_observation = memory.nbytes / (memory.next_id - memory.oldest_id)  # bytes
     replay_bytes = int(min(max_bytes, min(capacity, done.steps + steps) * an_observation))
-    loaded = trainer.memory.next_id - trainer.memory.oldest_id  # observations, of a run that goes on
+    loaded = trainer.memory.next_id - trainer.memory.oldest_id  # observations of a continued run
     more_bytes = max(0, replay_bytes - int(loaded * an_observation))
     weights = sum(tensor.nbytes for tensor in learner.network.state_dict().values())
     cadence = trainer.recorder.cadence
@@ -122,7 +122,7 @@ def forecast(trainer: Trainer, *, capacity: int, max_bytes: int, size: int, stac
         steps=steps,
         memory=more_bytes + _WARM_MEMORY,
         memory_available=psutil.virtual_memory().available,
-        # Two generations of all networks and two moments; weights of each evaluation, in the folder and in MLflow.
+        # Two generations of all networks and two moments; each evaluation's weights, in the folder and in MLflow.
         disk=int(more_bytes + (10 if learner.ema else 8) * weights + 2 * evaluations * weights),
         disk_available=shutil.disk_usage(folder).free,
         held=max_bytes / an_observation,

@@ -1,4 +1,4 @@
-"""The plan of a training, and how often it is recorded."""
+"""Plan a training, and how often to record it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -22,13 +22,13 @@ class Counters:
     steps: Count = 0
     frames: Count = 0
     episodes: Count = 0
-    random: Count = 0  # decisions that chance took
+    random: Count = 0  # random decisions
     learn_ticks: Count = 0  # multiples of learn_every that have passed
     seconds: Annotated[float, Field(ge=0, lt=1e12)] = 0.0
 
     @classmethod
     def of(cls, saved: Mapping[str, Any]) -> Self:
-        """Return the counters that a checkpoint holds. Raises: KeyError, TypeError, ValueError."""
+        """Return a checkpoint's counters. Raises: KeyError, TypeError, ValueError."""
         counters = checked(cls, {field.name: saved[field.name] for field in fields(cls)})
         if counters.episodes > counters.steps:
             raise ValueError(f"{counters.episodes} episodes in {counters.steps} steps")
@@ -54,7 +54,7 @@ class Plan:
     epsilon: Schedule
     learning_rate: Schedule  # share of the phase's
     returns: Returns
-    terminal_on_life_loss: bool  # for the learner; the episode goes on
+    terminal_on_life_loss: bool  # for the learner; the episode continues
     learn_every: int  # steps
     learn_start: int  # transitions in the memory
     batch_size: int  # transitions
@@ -69,7 +69,7 @@ class Plan:
         return counters.episodes if self.unit == "episodes" else counters.steps
 
     def phase_at(self, counters: Counters) -> Phase:
-        """Return the phase under way; after the plan's end, the last one."""
+        """Return the current phase; after the plan's end, the last one."""
         done = self.done(counters)
         for phase in self.phases:
             done -= phase.length
@@ -83,32 +83,32 @@ class Plan:
         return self.phase_at(counters).learning_rate * share
 
     def epsilon_at(self, counters: Counters) -> float:
-        """Return the probability that chance takes the next decision."""
-        # The report counts the episode under way: its first has epsilon(1), not epsilon(0).
+        """Return the probability that the next decision is random."""
+        # The report counts the current episode: its first has epsilon(1), not epsilon(0).
         running = 1 if self.unit == "episodes" else 0
         return self.epsilon((self.done(counters) + running) / self.length, counters.steps)
 
 
 @dataclass(frozen=True)
 class Cadence:
-    """How often a training is recorded, evaluated and committed, without influence on learning."""
+    """How often to record, evaluate and commit a training; does not influence learning."""
 
     curve_steps: int  # steps between two points of a curve
     histogram_episodes: int  # episodes in a window's histogram
     commit_episodes: int  # episodes between two commits
-    commit_seconds: float  # seconds between two commits at the most
+    commit_seconds: float  # at most, between two commits
     evaluate_episodes: int | None  # training episodes between two evaluations
     evaluate_steps: int | None  # training steps between two evaluations
     evaluate_at_end: bool
-    interim_episodes: int  # of an evaluation amid the training
+    interim_episodes: int  # of an evaluation during the training
     final_episodes: int  # of the one at its end
 
 
 def step_of(updates: int, learn_start: int, learn_every: int) -> int:
-    """Return the step at which about so many updates have been made."""
+    """Return the approximate step of an update."""
     return learn_start + updates * learn_every
 
 
 def passed(every: int | None, before: int, now: int) -> bool:
-    """Tell whether a multiple of `every` lies in (before, now]; False for None."""
+    """Return whether a multiple of `every` lies in (before, now]; False for None."""
     return every is not None and now // every > before // every

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from atlantis_exp.training.evaluation import Episode, Evaluation
 
 _DRAW_SECONDS = 0.25  # between two states of the bar
-_WINDOW_SECONDS = 30.0  # that the pace is measured over
+_WINDOW_SECONDS = 30.0  # of the measured pace
 _MARK_SECONDS = 0.25  # between two marks in that window
 
 
 class Pace:
-    """Steps a second over the last half minute, pauses not counted."""
+    """Measure steps a second over the last half minute, without pauses."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -42,7 +42,7 @@ class Pace:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Do not count the time of the block."""
+        """Exclude the time of the block."""
         start = self._clock()
         try:
             yield
@@ -53,7 +53,7 @@ class Pace:
 
     @property
     def steps_per_second(self) -> float:
-        """As of the latest tick; 0 before there are two."""
+        """The pace at the latest tick; 0 before the second one."""
         if not self._marks or (seconds := self._latest[0] - self._marks[0][0]) <= 0:
             return 0.0
         return (self._latest[1] - self._marks[0][1]) / seconds
@@ -61,7 +61,7 @@ class Pace:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """How far a training is."""
+    """The progress of a training."""
 
     episode: int  # under way, counted from 1
     scores: Sequence[float]  # of the last 20 episodes
@@ -71,16 +71,16 @@ class Snapshot:
     updates: int
     steps_per_second: float
     phase: str
-    steps_left: float | None  # until the plan or the budget ends; None where nothing tells
+    steps_left: float | None  # until the plan or the budget ends; None if unknown
 
     @property
     def share(self) -> float:
-        """How much of the training is done, in steps."""
+        """The completed share of the training, in steps."""
         return 0.0 if self.steps_left is None else self.steps / (self.steps + max(self.steps_left, 0.0))
 
 
 class Progress:
-    """Shows episode, score, mean of 20, epsilon, steps a second, phase and time left."""
+    """Show episode, score, mean of 20, epsilon, steps a second, phase and time left."""
 
     def __init__(self, console: Console | None = None) -> None:
         self.console = console or terminal.console()
@@ -94,7 +94,7 @@ class Progress:
         self.console.print(text)
 
     def is_due(self) -> bool:
-        """Tell whether it is time for `show`: a few times a second on a terminal, now and then elsewhere."""
+        """Return whether `show` is due: a few times a second on a terminal, now and then elsewhere."""
         if self.console.is_terminal:
             return self._shown is None or time.monotonic() - self._shown >= _DRAW_SECONDS
         return self._is_time_for_a_line()
@@ -115,7 +115,7 @@ class Progress:
     def evaluating(self, episodes: Sequence["Episode"], most_frames: int) -> None:
         """Write a line now and then; call it after every step of an evaluation.
 
-        No episode has more than `most_frames`, which bounds the time left.
+        The cap of `most_frames` an episode bounds the time left.
         """
         if self._evaluated is not episodes:
             self._evaluated, self._began = episodes, time.monotonic()
@@ -135,7 +135,7 @@ class Progress:
             self._write(f"  film: {drawn:,} of {pictures:,} steps")
 
     def evaluated(self, step: int, frames: int, evaluation: "Evaluation") -> None:
-        """Print a training's evaluation at a step, after so many frames of training."""
+        """Print a training's evaluation at a step, after a number of training frames."""
         summary, game = evaluation.summary, evaluation.game
         self.say(
             f"step {step:,}, {summary.episodes} episodes evaluated at epsilon {evaluation.epsilon}: "
@@ -143,7 +143,7 @@ class Progress:
             f"low {summary.low:,.0f}, interquartile mean {summary.interquartile_mean:,.0f}"
         )
         if evaluation.collapsed:
-            held = "" if isnan(game.held_score) else f"; any one action, held, scores {game.held_score:,.0f}"
+            held = "" if isnan(game.held_score) else f"; holding any one action scores {game.held_score:,.0f}"
             self.say(f"warning: the policy has {evaluation.policy}{held}")
         if summary.mean < game.random_score and frames <= game.early_frames:
             self.say(
@@ -152,7 +152,7 @@ class Progress:
             )
 
     def _is_time_for_a_line(self) -> bool:
-        if self._shown is None:  # the first one comes when there is something to tell
+        if self._shown is None:  # the first line waits for some progress
             self._shown = time.monotonic()
         return time.monotonic() - self._shown >= terminal.until_line(self._lines)
 

@@ -1,6 +1,6 @@
 """Record a training: its episodes, curves, pictures, evaluations and description.
 
-To add a metric of the training see `Recorder.curves`, of an evaluation `Evaluation.metrics`.
+`Recorder.curves` is the place to add a metric of the training, `Evaluation.metrics` one of an evaluation.
 """
 
 import hashlib
@@ -25,13 +25,13 @@ from atlantis_exp.training.progress import Pace, Progress, Snapshot
 
 Stop = Callable[[], bool]
 Play = Callable[[int, Progress, Stop], Evaluation]
-"""Plays so many episodes. Raises: Stopped."""
+"""Plays a number of episodes. Raises: Stopped."""
 Film = Callable[[Evaluation, Progress, Stop], bytes | None]
-"""Returns an mp4 of an evaluation's best episode, None if none is wanted. Raises: Stopped."""
+"""Returns an mp4 of an evaluation's best episode, or None without a film. Raises: Stopped."""
 
 
 class Played(NamedTuple):
-    """An episode of the training, with the training's counters at its end."""
+    """A training episode, with the training's counters at its end."""
 
     episode: int  # counted from 1
     step: int
@@ -43,7 +43,7 @@ class Played(NamedTuple):
 
 @dataclass(frozen=True)
 class _Saved:
-    """The part of a recorder's state about evaluations, checked when it is loaded."""
+    """The evaluations in a recorder's state, for checks on loading."""
 
     best_mean: float | None
     evaluations: Annotated[int, Field(ge=0, lt=2**53)]
@@ -52,16 +52,16 @@ class _Saved:
     best_step: Annotated[int, Field(ge=-1, lt=2**53)]
     last_report: str
     last_metrics: dict[str, int | float]  # ints stay ints: resume is bit for bit
-    best_sha256: str = ""  # 0.1.0 has none
+    best_sha256: str = ""  # missing in 0.1.0
 
 
 class Diverged(Fault):
-    """The loss was not finite; the last commit is from before."""
+    """The loss was not finite; the last commit is older."""
 
 
 @dataclass(kw_only=True, eq=False)
 class Recorder:
-    """Tells a tracker and a person how a training goes, without influence on it."""
+    """Report a training to a tracker and a person, without influence on it."""
 
     plan: Plan
     cadence: Cadence
@@ -81,7 +81,7 @@ class Recorder:
         self.best_sha256 = ""  # of the weights evaluated there, as a file
         self.evaluations = 0
         self.evaluated_at = -1  # step, as it was written down
-        self.evaluation_pending = False  # of this very step: it was asked to stop; redone on resume
+        self.evaluation_pending = False  # of this step: it was stopped; resume repeats it
         self.last_report = ""  # of the latest evaluation
         self.last_metrics: dict[str, float] = {}  # of the latest evaluation
         self._pace = Pace()
@@ -100,7 +100,7 @@ class Recorder:
         self._describe(outcome, counters)
 
     def episode(self, played: Played) -> None:
-        """Record an episode, and the pictures of its window once that is full."""
+        """Record an episode, and draw the pictures of a full window."""
         self.episodes.append(played)
         self.tracker.metrics({"score/episode": played.score, "score/length": played.length}, played.step)
         if played.episode % self.cadence.histogram_episodes == 0:
@@ -116,9 +116,9 @@ class Recorder:
 
     def curves(self, counters: Counters) -> None:
         """Record a point of every curve. Raises: Diverged."""
-        # At the last multiple: curves of runs with different num_envs then share their grid.
+        # At the last multiple, so that curves of runs with different num_envs share their grid.
         step = counters.steps - counters.steps % self.cadence.curve_steps
-        self._pace.tick(counters.steps)  # or the first step of a session would have none
+        self._pace.tick(counters.steps)  # else the first step of a session would have none
         measures = {f"learning/{name}": value for name, value in self.learner.statistics().items()}
         self.refuse_divergence()
         if self.episodes:
@@ -148,15 +148,15 @@ class Recorder:
         )
 
     def refuse_divergence(self) -> None:
-        """Raise Diverged if any loss so far was not finite; waits for the device."""
+        """Raise Diverged if any loss so far was not finite; wait for the device."""
         if (update := self.learner.first_nonfinite_update()) is not None:
             raise Diverged(
                 f"the loss of update {update} is not finite, and would be again; the run stays at its last commit: "
-                "lower optimizer.lr or set objective.reward_clip, which makes another run"
+                "lower optimizer.lr or set objective.reward_clip, which starts a new run"
             )
 
     def show(self, counters: Counters) -> None:
-        """Show the progress if that is due; call it after every step."""
+        """Show the progress if due; call it after every step."""
         self._pace.tick(counters.steps)
         if self.progress.is_due():
             self.progress.show(self._snapshot(counters))
@@ -165,12 +165,12 @@ class Recorder:
         """Evaluate this step's network and keep its weights; pending if stopped. Raises: Diverged."""
         step = counters.steps
         if (every := self.cadence.evaluate_steps) and not has_ended:
-            # It belongs to the step at which it fell due, as with the curves; the last one to the run's last step,
-            # where a comparison looks for it.
+            # It belongs to the step at which it was due, as with the curves; the last one to the run's last step, where
+            # comparisons look for it.
             due = step - step % every
             step = due if step - due < num_envs else step
         episodes = self.cadence.final_episodes if has_ended else self.cadence.interim_episodes
-        # A run that goes on from an evaluation may end there, and then owes a longer one.
+        # A run that continues from an evaluation may end there, and then owes a longer one.
         if step == self.evaluated_at and self.last_metrics["evaluation/episodes"] >= episodes:
             return
         self.refuse_divergence()
@@ -245,7 +245,7 @@ class Recorder:
         self.tracker.artifact(EPISODES, "\n".join([",".join(Played._fields), *lines, ""]).encode())
 
     def _describe(self, state: str, counters: Counters) -> None:
-        """Note in markdown the run's state, progress and result."""
+        """Describe the run's state, progress and result in markdown."""
         reached = self.last_metrics
         lines = [  # the result first: MLflow shows five lines and folds the rest
             f"**{state}** at step {counters.steps:,}: {counters.episodes:,} episodes, {counters.frames:,} frames, "

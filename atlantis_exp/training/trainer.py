@@ -1,4 +1,4 @@
-"""The training loop (report figure 3.1), as a page that reads like it."""
+"""Run the training loop (report figure 3.1)."""
 
 import math
 import time
@@ -26,7 +26,7 @@ Outcome = Literal["finished", "budget", "interrupted"]
 
 @dataclass(kw_only=True, eq=False)
 class Trainer:
-    """Trains one run, made of built parts, until the plan, the budget or a stop request ends it.
+    """Train one run until the plan, the budget or a stop request ends it.
 
     With one environment the loop is the report's. With several, due updates run while the emulators play; the result
     never depends on timing.
@@ -38,7 +38,7 @@ class Trainer:
     actor: Actor
     memory: ReplayMemory
     learner: Learner
-    exploration: Sequence[np.random.Generator]  # one an environment
+    exploration: Sequence[np.random.Generator]  # one per environment
     sampling: np.random.Generator
     seeds: Sequence[int]  # of the first episodes
     recorder: Recorder
@@ -48,16 +48,16 @@ class Trainer:
 
     def __post_init__(self) -> None:
         self.counters = Counters()
-        self.scores = np.zeros(self.emulators.num_envs)  # of the episodes under way
-        self.lengths = np.zeros(self.emulators.num_envs, np.int64)  # of the episodes under way, steps
+        self.scores = np.zeros(self.emulators.num_envs)  # of the current episodes
+        self.lengths = np.zeros(self.emulators.num_envs, np.int64)  # of the current episodes, steps
         self._errors: list[tuple[Sampler, npt.NDArray[np.int64], torch.Tensor]] = []  # of updates since the feedback
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
-        """Train from where the counters stand, and commit. In case of an error the last commit stays.
+        """Train on from the counters, and commit; after an error the last commit stays.
 
         Raises:
             Diverged: the loss is not finite.
-            WorkerDied: an emulator's process has ended or hangs.
+            WorkerDied: an emulator's process has died or hangs.
             OSError: a commit cannot be written.
         """
         overlap = self.emulators.num_envs > 1  # learn while they play
@@ -89,7 +89,7 @@ class Trainer:
         self._last_commit = time.monotonic()
 
     def state_dict(self) -> dict[str, Any]:
-        self._feed_back()  # the same as at the next update: nothing is drawn before
+        self._feed_back()  # as at the next update, since nothing is drawn before it
         return {
             "counters": asdict(self.counters),
             "learner": self.learner.state_dict(),
@@ -123,12 +123,12 @@ class Trainer:
             raise ValueError("the scores are not finite")
         self.recorder.load_state_dict(state)
         for env in range(self.emulators.num_envs):
-            if not self.memory.is_under_way(env):  # the episode's beginning was lost
+            if not self.memory.is_under_way(env):  # the episode's start was lost
                 self.memory.begin(env, self.stack.state[env, -1])
 
     @cached_property
     def flops_per_update(self) -> int:
-        """The floating-point operations of one update."""
+        """Floating-point operations of one update."""
         _, stack, height, width = self.stack.state.shape
         return self.learner.update_flops((stack, height, width), self.plan.batch_size)
 
@@ -148,7 +148,7 @@ class Trainer:
 
     @property
     def last_step(self) -> int | None:
-        """The step at which the budget will end the training, about; None without a budget."""
+        """The approximate step at which the budget will end the training; None without a budget."""
         plan, steps = self.plan, [] if self.max_steps is None else [self.max_steps]
         if self.max_updates is not None:
             steps.append(step_of(self.max_updates, plan.learn_start, plan.learn_every))
@@ -170,7 +170,7 @@ class Trainer:
             self.memory.begin(env, observations[row])
 
     def _due_batches(self, sampler: Sampler) -> Iterator[Draw]:
-        """Draw a batch for each update that is due."""
+        """Draw a batch for each due update."""
         due = self.counters.steps // self.plan.learn_every - self.counters.learn_ticks
         self.counters.learn_ticks += due
         if len(self.memory) <= self.plan.learn_start:
@@ -186,7 +186,7 @@ class Trainer:
         self._errors.clear()
 
     def _observe(self, decisions: Decisions) -> Steps:
-        """Wait for the emulators, and store their step."""
+        """Wait for the emulators and store their step."""
         steps = self.emulators.receive()
         self.stack.push(steps.observations)
         terminal = steps.terminated | (steps.life_lost & self.plan.terminal_on_life_loss)
@@ -201,7 +201,7 @@ class Trainer:
         return steps
 
     def _record(self, steps: Steps, stop: Callable[[], bool]) -> None:
-        """Begin new episodes where some have ended; record, evaluate and commit if due."""
+        """Start new episodes for ended ones; record, evaluate and commit if due."""
         counters, cadence = self.counters, self.recorder.cadence
         steps_before, episodes_before = counters.steps - self.emulators.num_envs, counters.episodes
         for env in np.flatnonzero(steps.terminated | steps.truncated).tolist():

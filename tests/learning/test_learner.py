@@ -254,7 +254,7 @@ def test_shards_leave_no_bit_to_chance(precision: Precision) -> None:
 
 
 def test_a_network_whose_samples_meet_is_not_split() -> None:
-    with pytest.raises(ValueError, match="does not say splits_batches"):
+    with pytest.raises(ValueError, match="without splits_batches"):
         _learner(ResNetDQN, shards=2)
 
 

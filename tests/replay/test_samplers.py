@@ -200,5 +200,5 @@ def test_priorities_of_nothing_do_not_hang_the_search() -> None:
     memory, sampler = memory_with_rewards(np.zeros(15)), PrioritizedSampler(0.5, 0.5)
     sampler.sample(memory, 4, np.random.default_rng(0))
     sampler.load_state_dict({**sampler.state_dict(), "priorities": np.zeros(16)})
-    with pytest.raises(Fault, match="not of this replay memory"):
+    with pytest.raises(Fault, match="do not match the replay memory"):
         sampler.sample(memory, 4, np.random.default_rng(0))

@@ -424,7 +424,7 @@ def test_counters_that_no_training_comes_to_are_one_line(
     """Before anything is expected of them."""
     saved = {**dataclasses.asdict(Counters(steps=80, episodes=2)), **forged}
     monkeypatch.setattr(Checkpoints, "load", lambda *_: {"counters": saved})
-    with pytest.raises(CheckpointError, match=r"is not of this training \((ValueError|TypeError): "):
+    with pytest.raises(CheckpointError, match=r"does not fit this training \((ValueError|TypeError): "):
         train(Job(tiny(*SHORT, "budget.forecast=warn")))
 
 
@@ -456,7 +456,7 @@ def test_a_journal_that_was_cut_is_one_clear_line(tiny: Compose) -> None:
     train(Job(config))
     path = RunFolder.of(config).path / "journal.jsonl"
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(Fault, match="is shorter than the checkpoint says"):
+    with pytest.raises(Fault, match="is shorter than in the checkpoint"):
         train(Job(tiny("evaluation.at_end=false", "evaluation.every_steps=null")))
 
 
@@ -520,7 +520,7 @@ def test_a_killed_run_is_shown_as_interrupted_then_continued_and_sigterm_ends_it
     ended.send_signal(signal.SIGTERM)
     out, error = ended.communicate()
     assert ended.returncode == 143
-    assert f"run {folder.name} was killed; the command that started it continues it" in out
+    assert f"run {folder.name} was killed; repeat its command to continue it" in out
     assert f"continuing run {folder.name} at step" in out
     assert error.startswith(f"atlantis_exp: SIGTERM: run {folder.name} is committed at step")
     assert "continue with: python -m atlantis_exp experiment=quick" in error

@@ -78,7 +78,7 @@ def test_a_store_follows_its_outputs_folder_and_touches_the_old_place_no_more(
             "report/index.html"
         ]
     assert [record.getMessage() for record in caplog.records if record.name.startswith("atlantis_exp")] == [
-        f"{there.resolve()} was moved or copied from {outputs}: its MLflow store follows"
+        f"{there.resolve()} was moved or copied from {outputs}: corrected the paths in its store"
     ]
     assert rows(there, "SELECT count(*) FROM runs WHERE lifecycle_stage = 'active'") == [(2,)]
     folders = rows(there, "SELECT value FROM tags WHERE key = 'atlantis.folder' ORDER BY value")

@@ -399,7 +399,7 @@ def test_a_file_that_is_gone_does_not_hold_up_the_rest(
     (tmp_path / "artifacts/video.mp4").unlink()
     publish(tmp_path, store)
     assert len(points(root, tmp_path)) == 1
-    assert "1 files are gone and not published, such as video.mp4" in caplog.text
+    assert "1 files are missing and not published, such as video.mp4" in caplog.text
 
 
 def test_a_folder_that_never_committed_is_left_alone(tmp_path: Path, store: Store) -> None:

@@ -116,7 +116,7 @@ def test_a_command_publishes_its_run_and_others_and_says_where_it_could_not(
     assert capsys.readouterr().err == ""
     with publishing.publishing(folder, away, tmp_path, {}, seconds=0.1):
         pass
-    assert "MLflow has not taken all of own yet" in capsys.readouterr().err
+    assert "MLflow has not received all of own yet" in capsys.readouterr().err
 
 
 def test_the_way_to_the_ui_says_how_many_runs_the_store_lacks(tmp_path: Path) -> None:

@@ -99,7 +99,7 @@ def test_an_experiment_that_was_deleted_is_restored_and_a_line_says_so(
     publish(folder, Store(tmp_path))
     assert rows(tmp_path, "SELECT status, lifecycle_stage FROM runs") == [("FINISHED", "active")]
     assert [record.getMessage() for record in caplog.records] == [
-        "The MLflow experiment atlantis had been deleted: it is restored, with its runs"
+        "Restored the deleted MLflow experiment atlantis with its runs"
     ]
 
 
@@ -128,14 +128,14 @@ def test_a_database_that_cannot_be_used_is_one_line_with_the_remedy_for_every_co
     spoil(tmp_path / "mlflow.db")
     folder = tmp_path / "runs" / "run"
     a_full_journal(folder)
-    remedy = rf"move it away, and .* sync paths.outputs={tmp_path} makes it again"
+    remedy = rf"move it away, and .* sync paths.outputs={tmp_path} rebuilds it"
     said = rf"{tmp_path}/mlflow.db cannot be used \(.*\): {remedy}"
     with pytest.raises(Fault, match=said):
         [*publish_all(tmp_path, Store(tmp_path))]
     with pytest.raises(Fault, match=said):
         Store(tmp_path).prepare()
     Publisher(folder, Store(tmp_path))
-    line = rf"Publishing to MLflow fails \({said}\); the run goes on and is published later"
+    line = rf"Publishing to MLflow fails \({said}\); the run continues and is published later"
     patience = time.monotonic() + 120
     while not any(re.fullmatch(line, record.getMessage()) for record in caplog.records):
         assert time.monotonic() < patience
