@@ -480,11 +480,11 @@ def test_a_head_of_quantiles_needs_their_number(plugins: Path, said: Said) -> No
         ("plugins=./none.py", "/.*/none.py is not a file"),
         ("plugins=./other/mynet.py,mynet.py", r"mynet\.py: /.*/other/mynet\.py is called mynet, too; rename one"),
         ("plugins=copy.py,mynet.py", r"/mynet.py:13: model=mynet is also in /.*/copy\.py"),
-        ("plugins=./my-net.py", r"write a file NAME\.py"),
+        ("plugins=./my-net.py", r"name a file NAME\.py"),
         ("plugins=nothing", "no such distribution is installed"),
         ("plugins=3", "write files and distributions"),
         ("plugins={a:1}", "no such distribution"),
-        ("plugins=mynet.py plugins=copy.py", "write one of the two"),
+        ("plugins=mynet.py plugins=copy.py", "contradicts plugins="),
         ("search trials=2 plugins=mynet.py model=mynt,cnn", "'mynet'"),
     ],
 )

@@ -170,7 +170,7 @@ def launcher(arguments: Sequence[str]) -> Launcher:
         if key == "hydra.mode":
             raise ConfigError(f"{text}: write -m for a sweep")
         if override.is_delete() or not (is_choice or key.startswith("hydra.launcher.")):
-            raise ConfigError(f"{text}: of Hydra's keys, only hydra/launcher and hydra.launcher.KEY can be set")
+            raise ConfigError(f"{text}: of Hydra's keys, set only hydra/launcher=NAME and hydra.launcher.KEY=VALUE")
         if not flags.multirun:
             raise ConfigError(f"{text}: applies to a sweep; add -m or drop it")
         if is_choice:

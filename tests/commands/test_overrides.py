@@ -242,7 +242,7 @@ def test_a_plugin_of_an_unknown_user_is_one_line_before_hydra_reads_it() -> None
             "these values make 15,000 jobs; write values for at most 10,000",
         ),
         (f"env.crop={'[' * 500}1{']' * 500}", f"env.crop={'[' * 51}...: lists nested too deeply"),
-        ("hydra/launcher=null", "hydra/launcher=null: of Hydra's keys, only"),
+        ("hydra/launcher=null", "hydra/launcher=null: of Hydra's keys, set only"),
         (
             "hydra/launcher=joblib hydra.launcher.n_jobs=0",
             "hydra.launcher.n_jobs=0: write the number of jobs at a time",
