@@ -140,7 +140,7 @@ def _check_output(config: cfg.Config, network: nn.Module) -> None:
     if config.model.head == "quantile":
         shape = (*shape, config.objective.settings["quantiles"])
     with component.blamed(), torch.no_grad():
-        made = tuple(network.eval()(torch.zeros(2, env.stack, env.size, env.size)).shape)
+        made = tuple(network.eval()(torch.zeros(2, *env.state_shape)).shape)
         if made != shape:
             raise TypeError(f"{component.load().__name__} returns {made} for two states; should be {shape}")
 
@@ -186,8 +186,7 @@ def _architecture(config: cfg.Config) -> nn.Module:
         raise ConfigError(needs(config))
     if config.model.head == "quantile":
         head = partial(QuantileHead, quantiles=objective.settings["quantiles"])
-    shape = env.stack, env.size, env.size
-    network: nn.Module = build_component(config, config.model, shape, _num_actions(config), head)
+    network: nn.Module = build_component(config, config.model, env.state_shape, _num_actions(config), head)
     return network
 
 
@@ -308,7 +307,7 @@ def build_evaluator(env: cfg.EnvConfig, evaluation: cfg.EvaluationConfig, cores:
         seed=evaluation.seed,
         num_envs=evaluation.at_once,
         size=env.size,
-        stack=env.stack,
+        lags=env.lags,
         most_frames=env.max_frames,
         video="first_minute" if evaluation.video is True else evaluation.video or None,
     )
@@ -318,7 +317,7 @@ def build_memory(config: cfg.Config) -> ReplayMemory:
     """Return an empty replay memory. Raises: ConfigError if this machine cannot reserve it."""
     env, replay = config.env, config.replay
     try:
-        return ReplayMemory(replay.capacity, (env.size, env.size), stack=env.stack, budget_bytes=replay.max_bytes)
+        return ReplayMemory(replay.capacity, (env.size, env.size), lags=env.lags, budget_bytes=replay.max_bytes)
     except MemoryError:
         raise ConfigError(f"replay.max_bytes={replay.max_bytes}: more than this machine can reserve") from None
 
@@ -350,7 +349,7 @@ def build_trainer(
     trainer = Trainer(
         plan=plan,
         emulators=make_emulators(evaluator.make_emulator, env.num_envs, env.workers or cores),
-        stack=FrameStack(env.num_envs, env.size, env.stack),
+        stack=FrameStack(env.num_envs, env.size, env.lags),
         actor=EpsilonGreedy(learner.q_values, len(game.actions)),
         memory=memory,
         learner=learner,

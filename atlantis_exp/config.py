@@ -7,9 +7,10 @@ import dataclasses
 import json
 import math
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import MISSING, field
 from functools import cache
+from itertools import pairwise
 from keyword import iskeyword
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -36,6 +37,8 @@ from atlantis_exp.faults import ConfigError
 STRICT = ConfigDict(defer_build=True, strict=True, extra="forbid", allow_inf_nan=False)
 
 Frameskip = Annotated[int, Field(ge=1, le=256)]
+_MOST_OBSERVATIONS = 16  # in a state
+_Lag = Annotated[int, Field(ge=0, le=64)]  # steps; each environment keeps as many observations, also in checkpoints
 _MOST_GAMES = 64  # of an evaluation, side by side
 Episodes = Annotated[int, Field(ge=1, le=10**6)]  # of one evaluation
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
@@ -62,6 +65,24 @@ _INDEX_BYTES = 23  # of the replay memory, per observation
 SCREEN = (210, 160)  # rows, columns of the emulator's screen
 
 
+def _check_stack(stack: int | tuple[int, ...]) -> int | tuple[int, ...]:
+    """Return a stack by the number of its observations if it has no gaps: each state has one name."""
+    if isinstance(stack, int):
+        return stack
+    if stack[0] != 0 or any(later <= lag for lag, later in pairwise(stack)):
+        raise ConfigError(
+            f"env.stack={list(stack)}: should be steps ago that ascend from 0, as in env.stack=[0,1,2,3,8,16,24]"
+        )
+    return len(stack) if stack[-1] == len(stack) - 1 else stack
+
+
+Stack = Annotated[
+    Annotated[int, Field(ge=1, le=_MOST_OBSERVATIONS)]
+    | Annotated[tuple[_Lag, ...], Field(min_length=1, max_length=_MOST_OBSERVATIONS)],
+    AfterValidator(_check_stack),
+]
+
+
 @dataclass(config=STRICT, kw_only=True, frozen=True)
 class EnvConfig:
     """One game and how its screen becomes an observation (report figure 2.3)."""
@@ -75,7 +96,7 @@ class EnvConfig:
     max_pool: bool
     crop: tuple[int, int, int, int]  # UP, RIGHT, DOWN, LEFT: screen[UP:DOWN, LEFT:RIGHT]
     size: Size  # pixels
-    stack: Annotated[int, Field(ge=1, le=8)]  # observations
+    stack: Stack  # observations of a state: their number, or how many steps ago each was
     num_envs: Annotated[int, Field(ge=1, le=64)]
     workers: Annotated[int, Field(ge=1, le=64)] | None  # processes; null: one per core, in evaluations one fewer
 
@@ -97,6 +118,16 @@ class EnvConfig:
             raise ConfigError(
                 "env.max_pool=true: needs one fixed env.frameskip of at least 2, as in env=atlantis_standard"
             )
+
+    @property
+    def lags(self) -> Sequence[int]:
+        """How many steps ago each of a state's observations was, ascending from 0."""
+        return range(self.stack) if isinstance(self.stack, int) else self.stack
+
+    @property
+    def state_shape(self) -> tuple[int, int, int]:
+        """The number of a state's observations, and their rows and columns."""
+        return len(self.lags), self.size, self.size
 
     @property
     def game(self) -> Component | None:
@@ -433,7 +464,7 @@ class Config:
                 f"at most {self.replay.capacity}"
             )
         # An environment's newest observation has no successor yet, and its oldest no longer have a whole stack.
-        most = self.replay.capacity - self.env.num_envs * (self.env.stack + 1)
+        most = self.replay.capacity - self.env.num_envs * (self.env.lags[-1] + 2)
         if self.training.learn_start >= most:
             raise ConfigError(
                 f"training.learn_start={self.training.learn_start}: should be less than {most}, the transitions that "

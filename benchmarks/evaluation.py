@@ -88,7 +88,7 @@ def passing(folder: str, num_envs: int) -> Iterator[Measure[float]]:
     """The network's pass over a batch."""
     card, weights = read_card(Path(folder))
     actor, env = build_exported_actor(card.config, weights, "cpu"), card.config.env
-    states = np.random.default_rng(0).integers(256, size=(num_envs, env.stack, env.size, env.size), dtype=np.uint8)
+    states = np.random.default_rng(0).integers(256, size=(num_envs, *env.state_shape), dtype=np.uint8)
     call = functools.partial(actor.q_values, states)  # type: ignore[attr-defined]
     yield lambda seconds: num_envs * calls_per_second(call, seconds)
 

@@ -52,7 +52,7 @@ def update_of(config: Config) -> Callable[[], object]:
     learner, batch_size = build_learner(config), config.training.batch_size
     rng = np.random.default_rng(0)
     # In the replay memory's layout: frame by frame, viewed as state by state.
-    frames = rng.integers(0, 256, (config.env.stack + 1, batch_size, config.env.size, config.env.size), np.uint8)
+    frames = rng.integers(0, 256, (len(config.env.lags) + 1, batch_size, config.env.size, config.env.size), np.uint8)
     states = frames.swapaxes(0, 1)
     batch = (
         states[:, :-1],
@@ -67,7 +67,7 @@ def update_of(config: Config) -> Callable[[], object]:
 def flops_of(config: Config) -> int:
     """Return the floating-point operations of a learner's update."""
     env = config.env
-    return build_learner(config).update_flops((env.stack, env.size, env.size), config.training.batch_size)
+    return build_learner(config).update_flops(env.state_shape, config.training.batch_size)
 
 
 def gemm_of(precision: str) -> Callable[[], None]:

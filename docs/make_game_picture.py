@@ -25,7 +25,7 @@ def main() -> None:
     env = dataclasses.replace(card.config.env, max_steps=STEPS, workers=1)
     actor = build_exported_actor(card.config, weights, "cpu")
     with build_emulators(env, 1, 1) as emulators:
-        protocol = {"epsilon": card.evaluation.epsilon, "seed": 0, "size": env.size, "stack": env.stack}
+        protocol = {"epsilon": card.evaluation.epsilon, "seed": 0, "size": env.size, "lags": env.lags}
         (episode,) = evaluate(actor, emulators, episodes=1, **protocol).episodes  # type: ignore[arg-type]
     latest: dict[bool, tuple[int, Moment]] = {}
     for step, moment in enumerate(moments(episode, make_emulator(env)())):

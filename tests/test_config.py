@@ -209,6 +209,16 @@ def test_an_address_that_is_none_or_holds_a_password_is_refused_without_repeatin
     assert "secret" not in str(refused.value)
 
 
+def test_a_stack_without_gaps_is_the_number_of_its_observations_and_one_with_gaps_another_run() -> None:
+    plain, listed, gaps = (
+        parse(Config, changed(TREES["cnn"], "env.stack", each)) for each in (4, [0, 1, 2, 3], [0, 3])
+    )
+    assert listed == plain
+    assert gaps.identity() != parse(Config, changed(TREES["cnn"], "env.stack", 2)).identity()
+    assert (list(plain.env.lags), list(gaps.env.lags)) == ([0, 1, 2, 3], [0, 3])
+    assert parse(Config, to_dict(gaps)) == gaps
+
+
 def test_the_identity_takes_what_weights_are_and_not_where_they_lie() -> None:
     def identity(weights: str) -> str:
         return parse(Config, changed(TREES["cnn"], "training.weights", weights)).identity()

@@ -70,6 +70,7 @@ RUN_NAMES = (
     "epsilon=linear env=atlantis_v5",
     "env=atlantis_standard env.num_envs=4 env.workers=2",
     "env.crop=[0,160,210,0] env.frameskip=4 env.size=50",
+    "env.stack=[0,1,2,3,8,16,24]",
     "phase=two_phase sampler=top_half",
     "phase=two_phase phase.first.lr=1e-4 phase.second.sampler=prioritized phase.second.episodes=7",
     "phase=steps phase.single.steps=1000 training.ema=100",
@@ -163,7 +164,7 @@ def assert_weights_are_as_recorded(name: str, weights: Mapping[str, torch.Tensor
 
 def filled_memory() -> ReplayMemory:
     """Three environments' random observations, actions and rewards, with ends among them."""
-    memory = ReplayMemory(120, (40, 40), stack=4, budget_bytes=2**22)
+    memory = ReplayMemory(120, (40, 40), lags=range(4), budget_bytes=2**22)
     rng = np.random.default_rng(7)
 
     def observation() -> npt.NDArray[np.uint8]:
@@ -189,7 +190,7 @@ def test_a_run_is_named_as_it_was(line: str) -> None:
 
 def test_recorded_names_of_runs_differ() -> None:
     names = json.loads((GOLDENS / "run_names.json").read_bytes())
-    assert len(set(names.values())) == len(RUN_NAMES) == 30
+    assert len(set(names.values())) == len(RUN_NAMES) == 31
 
 
 @pytest.mark.thinned(6)

@@ -23,7 +23,7 @@ def test_a_folder_is_what_its_card_says(folder: Path) -> None:
     actor = build_exported_actor(card.config, weights, "cpu")
     assert isinstance(actor, EpsilonGreedy)
     env = card.config.env
-    values = actor.q_values(np.zeros((2, env.stack, env.size, env.size), np.uint8))
+    values = actor.q_values(np.zeros((2, *env.state_shape), np.uint8))
     assert values.shape == (2, 4)
     assert np.isfinite(values).all()
 
@@ -40,7 +40,7 @@ def test_a_folder_plays_alike_on_any_number_of_cores(folder: Path, monkeypatch: 
     """Bit for bit: between two actions of nearly the same worth a rounding decides, and then the game is another."""
     card, weights = read_card(folder)
     env = card.config.env
-    states = np.random.default_rng(0).integers(0, 256, (40, env.stack, env.size, env.size), np.uint8)
+    states = np.random.default_rng(0).integers(0, 256, (40, *env.state_shape), np.uint8)
     values = []
     for cores in (1, 3):
         monkeypatch.setattr(build, "OWN_THREADS", cores)

@@ -78,7 +78,7 @@ def test_every_option_is_built_with_the_values_of_its_config(
         if group != "model":
             assert attributes(built, part.own) == part.settings
     with torch.no_grad():
-        outputs = learner.network(torch.zeros(1, env.stack, env.size, env.size)).shape
+        outputs = learner.network(torch.zeros(1, *env.state_shape)).shape
     assert outputs[2:] == tuple(objective.settings[name] for name in objective.own if name == "quantiles")
     assert (learner.tau, learner.target_every, learner.target_mode) == (target.tau, target.every, target.mode)
     assert plan.returns == Returns(
@@ -96,7 +96,7 @@ def test_every_option_is_built_with_the_values_of_its_config(
     assert (emulator["preprocessing"].crop, emulator["preprocessing"].size) == (env.crop, env.size)
     played = ("frameskip", "sticky", "max_frames", "max_steps", "noop_max", "max_pool")
     assert {name: emulator[name] for name in played} == attributes(env, played)
-    assert attributes(trainer.memory, ("capacity", "stack")) == {"capacity": config.replay.capacity, "stack": env.stack}
+    assert (trainer.memory.capacity, trainer.memory.lags) == (config.replay.capacity, tuple(env.lags))
     learnt = ("learn_every", "learn_start", "batch_size")
     assert attributes(plan, learnt) == attributes(config.training, learnt)
     assert learner.ema == config.training.ema

@@ -63,37 +63,52 @@ class Preprocessing:
 
 
 class FrameStack:
-    """The newest `stack` observations of each environment, oldest first; an episode's first one fills missing places.
+    """Observations of `lags` steps ago in each environment, oldest first; an episode's first one fills missing places.
 
     `state` is (num_envs, stack, size, size) uint8. Every change makes a new array, so earlier states never change:
     `stack_frame` of report figure 2.3 shifts in place, which makes every next state equal to its state.
     """
 
-    def __init__(self, num_envs: int, size: int, stack: int = 4) -> None:
-        self.state: Pixels = np.zeros((num_envs, stack, size, size), np.uint8)
+    def __init__(self, num_envs: int, size: int, lags: Sequence[int] = range(4)) -> None:
+        self._lags = np.array(lags)[::-1]
+        self._ring: Pixels = np.zeros((num_envs, lags[-1] + 1, size, size), np.uint8)  # each environment's newest
+        self._newest = np.zeros(num_envs, np.intp)  # each environment's place in it
+        self._all = np.arange(num_envs)
+        self.state = self._ago(self._all, self._lags)
 
     def reset(self, envs: Envs, observations: Pixels) -> Pixels:
         """Begin an episode in `envs` with these observations, (len(envs), size, size); return the state of all."""
-        return self._replace(envs, observations[:, np.newaxis])
+        rows = np.asarray(envs, np.intp)
+        self._ring[rows] = observations[:, np.newaxis]
+        return self._renew(rows)
 
     def push(self, observations: Pixels, envs: Envs | None = None) -> Pixels:
         """Append these observations, (len(envs), size, size), in `envs`, by default all; return the state of all."""
-        older = self.state if envs is None else self.state[np.asarray(envs, np.intp)]
-        stacks = np.concatenate([older[:, 1:], observations[:, np.newaxis]], axis=1)
-        if envs is None:
-            self.state = stacks
-            return stacks
-        return self._replace(envs, stacks)
+        rows = self._all if envs is None else np.asarray(envs, np.intp)
+        newest = self._newest[rows] = (self._newest[rows] + 1) % self._ring.shape[1]
+        self._ring[rows, newest] = observations
+        return self._renew(rows)
 
     def state_dict(self) -> dict[str, Any]:
-        return {"state": self.state}
+        return {"state": self._ago(self._all, np.arange(self._ring.shape[1])[::-1])}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        if (state["state"].shape, state["state"].dtype) != (self.state.shape, np.uint8):
+        if (state["state"].shape, state["state"].dtype) != (self._ring.shape, np.uint8):
             raise ValueError("the stacks do not have this game's shape")
-        self.state = state["state"]
+        self._ring, self._newest[:] = state["state"].copy(), self._ring.shape[1] - 1
+        self._renew(self._all)
 
-    def _replace(self, envs: Envs, stacks: Pixels) -> Pixels:
-        self.state = self.state.copy()
-        self.state[np.asarray(envs, np.intp)] = stacks
+    def _renew(self, rows: npt.NDArray[np.intp]) -> Pixels:
+        """Make the states of some environments anew; return the state of all."""
+        states = self._ago(rows, self._lags)
+        if rows is self._all:
+            self.state = states
+        else:
+            self.state = self.state.copy()
+            self.state[rows] = states
         return self.state
+
+    def _ago(self, rows: npt.NDArray[np.intp], lags: npt.NDArray[np.int_]) -> Pixels:
+        """Return the observations of some environments so many steps ago, (len(rows), len(lags), size, size)."""
+        rows = rows[:, np.newaxis]
+        return cast(Pixels, self._ring[rows, (self._newest[rows] - lags) % self._ring.shape[1]])

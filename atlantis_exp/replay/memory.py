@@ -1,6 +1,6 @@
 """Store observations once, and return transitions by id."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -58,24 +58,28 @@ class ReplayMemory:
 
     An entry is an observation with the step that led to it: action, reward, whether it is terminal, and `back`, the
     distance in ids to the previous observation (0: an episode's first). Entries never change. A transition has the id
-    of its state's newest observation; it is available while it has a successor and all frames of both states are
-    stored. A state that reaches back beyond its episode repeats the first observation (report figure 2.3, `is_new`).
+    of its state's newest observation; it is available while it has a successor and all frames from its state's oldest
+    to the next state's newest are stored. A state that reaches back beyond its episode repeats the first observation
+    (report figure 2.3, `is_new`).
 
     Args:
         capacity: maximum number of observations; an episode of n steps has n + 1.
         frame_shape: shape of an observation, (H, W).
-        stack: observations in a state.
+        lags: how many steps ago each of a state's observations was, ascending from 0.
         budget_bytes: bound on the memory's bytes; if observations compress badly, it forgets them earlier.
 
     Raises:
         ValueError: capacity or budget is too small for any use.
     """
 
-    def __init__(self, capacity: int, frame_shape: tuple[int, int], *, stack: int = 4, budget_bytes: int) -> None:
-        if capacity <= stack:
-            raise ValueError(f"a transition of {stack + 1} observations does not fit a replay capacity of {capacity}")
+    def __init__(
+        self, capacity: int, frame_shape: tuple[int, int], *, lags: Sequence[int] = range(4), budget_bytes: int
+    ) -> None:
+        if capacity < (needed := lags[-1] + 2):
+            raise ValueError(f"a transition of {needed} observations does not fit a replay capacity of {capacity}")
         self.capacity = capacity
-        self.stack = stack
+        self.lags = tuple(lags)
+        self._reach = lags[-1]  # steps from a state's newest observation back to its oldest
         self._back = np.zeros(capacity, np.uint16)
         self._forward = np.zeros(capacity, np.uint16)
         self._action = np.zeros(capacity, np.uint8)
@@ -163,14 +167,15 @@ class ReplayMemory:
             r_t += np.where(forward > 0, returns.gamma**steps * reward, 0.0)
             steps += forward > 0
         now, then = self._state(ids), self._state(last)
-        # Two states one step apart share all frames but one.
-        frames = self._frames.decode(np.vstack((now, then[-1:] if returns.n_step == 1 else then)))
+        # Two states one step apart share all frames but one, if they have no gaps.
+        overlap = returns.n_step == 1 and len(self.lags) == self._reach + 1
+        frames = self._frames.decode(np.vstack((now, then[-1:] if overlap else then)))
         terminal = self._terminal[last % self.capacity]
         return Transitions(
-            s_t=frames[: self.stack].swapaxes(0, 1),
+            s_t=frames[: len(self.lags)].swapaxes(0, 1),
             a_t=self._action[first % self.capacity].astype(np.int64),
             r_t=r_t.astype(np.float32),
-            s_tpm=frames[-self.stack :].swapaxes(0, 1),
+            s_tpm=frames[-len(self.lags) :].swapaxes(0, 1),
             discount=np.where(terminal, 0.0, returns.gamma**steps).astype(np.float32),
         )
 
@@ -252,7 +257,7 @@ class ReplayMemory:
         forward = np.zeros(len(ids), np.int64)
         forward[previous] = back[linked]
         reach = ids
-        for _ in range(self.stack - 1):
+        for _ in range(self._reach):
             stored = np.maximum(reach - self.oldest_id, 0)
             reach = np.where(reach >= self.oldest_id, reach - back[stored], reach)
         available = (forward > 0) & (reach >= self.oldest_id)
@@ -296,13 +301,13 @@ class ReplayMemory:
                 self._num_available += 1
 
     def _state_is_stored(self, k: int) -> bool:
-        for _ in range(self.stack - 1):
+        for _ in range(self._reach):
             k -= self._back.item(k % self.capacity)  # of an entry no longer stored: some distance further back
         return k >= self.oldest_id
 
     def _withdraw(self, evicted: int) -> None:
         k = evicted
-        for _ in range(self.stack):
+        for _ in range(self._reach + 1):
             slot = k % self.capacity
             self._num_available -= self._available.item(slot)
             self._available[slot] = False
@@ -311,9 +316,9 @@ class ReplayMemory:
     def _state(self, newest: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Return the ids of states' observations, (stack, B), oldest first."""
         newest_first = [newest]
-        for _ in range(self.stack - 1):
+        for _ in range(self._reach):
             newest_first.append(newest_first[-1] - self._back[newest_first[-1] % self.capacity])
-        return np.stack(newest_first[::-1])
+        return np.stack([newest_first[lag] for lag in reversed(self.lags)])
 
     def _successors(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         if not np.all(self.available(ids)):

@@ -77,7 +77,7 @@ def write_card(
         write_file(folder / "network.onnx", onnx)
         env = card.config.env
         files += (
-            f"\n\n`network.onnx`: {len(onnx):,} bytes, float32: `states`, uint8 (batch, {env.stack}, {env.size}, "
+            f"\n\n`network.onnx`: {len(onnx):,} bytes, float32: `states`, uint8 (batch, {len(env.lags)}, {env.size}, "
             f"{env.size}), to `q_values`, float32 (batch, actions)."
         )
     place = shown if len(shown.parts) > 1 and not shown.is_absolute() else f"./{shown.name}"

@@ -117,14 +117,14 @@ def _require(is_kept: object, otherwise: str) -> None:
 def _made(config: Config, side: int, head: str = "plain", seed: int = 0) -> nn.Module:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        made: nn.Module = build_component(config, config.model, (config.env.stack, side, side), _ACTIONS, _HEADS[head])
+        shape = len(config.env.lags), side, side
+        made: nn.Module = build_component(config, config.model, shape, _ACTIONS, _HEADS[head])
     seed_dropout(made, seed)
     return made
 
 
 def _states(config: Config, count: int) -> torch.Tensor:
-    side = config.env.size
-    return torch.rand(count, config.env.stack, side, side, generator=torch.Generator().manual_seed(0))
+    return torch.rand(count, *config.env.state_shape, generator=torch.Generator().manual_seed(0))
 
 
 def _learns(config: Config, head: str, side: int, precision: Any) -> None:
@@ -132,7 +132,7 @@ def _learns(config: Config, head: str, side: int, precision: Any) -> None:
     objective = Quantile(_QUANTILES) if head == "quantile" else DQN()
     optimizer = torch.optim.SGD(network.parameters(), lr=1e-3)
     learner = Learner(network, target, optimizer, objective, 1.0, precision=precision)
-    states = np.random.default_rng(0).integers(0, 256, (6, config.env.stack, side, side), np.uint8)
+    states = np.random.default_rng(0).integers(0, 256, (6, len(config.env.lags), side, side), np.uint8)
     _require(learner.q_values(states).shape == (6, _ACTIONS), f"values of shape {learner.q_values(states).shape}")
     before = copy.deepcopy(network.state_dict())
     rewards = np.arange(6, dtype=np.float32)
@@ -155,7 +155,7 @@ def _weights_return(config: Config) -> None:
     network, other = _made(config, side, seed=1), _made(config, side)
     stored = safetensors.torch.load(to_safetensors(network.state_dict()))
     with torch.device("meta"):
-        shape = config.env.stack, side, side
+        shape = config.env.state_shape
         build_component(config, config.model, shape, _ACTIONS, nn.Linear).load_state_dict(stored, assign=True)
     other.load_state_dict(stored)
     states = _states(config, 2)
@@ -218,7 +218,7 @@ def _objective_ends(config: Config) -> None:
 
 
 def _memory() -> ReplayMemory:
-    memory, rng = ReplayMemory(64, (8, 8), stack=4, budget_bytes=2**20), np.random.default_rng(0)
+    memory, rng = ReplayMemory(64, (8, 8), lags=range(4), budget_bytes=2**20), np.random.default_rng(0)
     memory.begin(0, rng.integers(0, 256, (8, 8), np.uint8))
     for step in range(40):
         memory.add(0, step % _ACTIONS, float(step % 3), rng.integers(0, 256, (8, 8), np.uint8), False)
@@ -312,12 +312,12 @@ def fingerprints(config: Config, outputs: Path) -> dict[str, str]:
 def _cost(name: str, job: Job, said: str) -> documents.Cost:
     """Measure a training on this machine; an update includes drawing its batch."""
     trainer, speed = measure(job, said=said)
-    size, batch = job.config.env.size, job.config.training.batch_size
+    batch = job.config.training.batch_size
     return documents.Cost(
         component=name,
-        pixels=size,
+        pixels=job.config.env.size,
         parameters=count_parameters(trainer.learner.network),
-        flops_per_sample=trainer.learner.update_flops((job.config.env.stack, size, size), batch) / batch,
+        flops_per_sample=trainer.learner.update_flops(job.config.env.state_shape, batch) / batch,
         updates_per_second=speed.updates_per_second,
         steps_per_second=speed.steps_per_second,
     )

@@ -53,7 +53,7 @@ def export_onnx(config: Config, weights: bytes) -> Exported:
     Raises: Fault if the export fails, or its values in states of a game differ from torch's.
     """
     network = build_trained_network(config, weights).eval()
-    shape = config.env.stack, config.env.size, config.env.size
+    shape = config.env.state_shape
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)  # torch warns that torchvision is missing
     try:
@@ -87,7 +87,7 @@ def _both(config: Config, network: nn.Module, content: bytes) -> tuple[Values, V
     import onnxruntime
 
     env, emulator = config.env, make_emulator(config.env)()
-    stack = FrameStack(1, env.size, env.stack)
+    stack = FrameStack(1, env.size, env.lags)
     stack.reset([0], emulator.reset(0)[np.newaxis])
     actions = np.random.default_rng(0).integers(len(emulator.game.actions), size=64).tolist()
     states = np.concatenate([stack.push(emulator.step(action).observation[np.newaxis]) for action in actions])

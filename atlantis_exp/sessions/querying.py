@@ -30,4 +30,4 @@ def query(*, env: EnvConfig) -> None:
     limits = [*([f"{env.max_steps:,} steps"] if env.max_steps else []), f"{env.max_frames:,} frames"]
     print(f"an episode ends: when the game is over, or after {' or '.join(limits)}")
     print(f"observation: rows {up}-{down - 1}, columns {left}-{right - 1}, grey, at {env.size}x{env.size} pixels")
-    print(f"state: {env.stack} observations")
+    print(f"state: the observations of {', '.join(map(str, env.lags))} steps ago")

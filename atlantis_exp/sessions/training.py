@@ -225,7 +225,7 @@ def _expected(trainer: Trainer, config: Config, done: Counters) -> Forecast:
         capacity=config.replay.capacity,
         max_bytes=config.replay.max_bytes,
         size=config.env.size,
-        stack=config.env.stack,
+        lags=config.env.lags,
         done=done,
     )
 

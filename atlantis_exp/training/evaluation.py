@@ -179,14 +179,15 @@ def evaluate(
     epsilon: float,
     seed: int,
     size: int,
-    stack: int,
+    lags: Sequence[int],
     on_step: Callable[[Sequence[Episode]], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Evaluation:
     """Play episodes side by side; `seed` and its index alone determine each.
 
-    While one half of the environments is emulated, the actor decides for the other. States have `stack` observations
-    of `size` x `size` pixels. Calls `stop` before every step of a half, and `on_step` with all episodes after it.
+    While one half of the environments is emulated, the actor decides for the other. States have the observations,
+    `size` x `size` pixels, of `lags` steps ago. Calls `stop` before every step of a half, and `on_step` with all
+    episodes after it.
 
     Raises:
         Stopped: `stop` returned True.
@@ -197,7 +198,7 @@ def evaluate(
         for index in range(episodes)
     ]
     streams = [np.random.default_rng(_seed_sequence(seed, index).spawn(1)[0]) for index in range(episodes)]
-    stacks = FrameStack(emulators.num_envs, size, stack)
+    stacks = FrameStack(emulators.num_envs, size, lags)
     waiting = iter(range(episodes))
     playing: dict[int, int] = {}  # environment to the episode it plays
     under_way: deque[tuple[range, npt.NDArray[np.int64], Decisions]] = deque()  # each with the half that it is of

@@ -1,6 +1,6 @@
 """Evaluate by a protocol: own emulators, epsilon, seed, film."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -22,7 +22,7 @@ class Evaluator:
     seed: int
     num_envs: int  # episodes played side by side
     size: int  # pixels
-    stack: int  # observations
+    lags: Sequence[int]  # steps ago, of a state's observations
     most_frames: int  # an episode
     video: Part | None  # the part of the best episode to film
 
@@ -43,7 +43,7 @@ class Evaluator:
                 epsilon=self.epsilon,
                 seed=self.seed,
                 size=self.size,
-                stack=self.stack,
+                lags=self.lags,
                 on_step=partial(progress.evaluating, most_frames=self.most_frames),
                 stop=stop,
             )

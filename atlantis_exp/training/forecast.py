@@ -5,7 +5,7 @@ import math
 import shutil
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,7 +65,9 @@ class Forecast:
         return None
 
 
-def forecast(trainer: Trainer, *, capacity: int, max_bytes: int, size: int, stack: int, done: Counters) -> Forecast:
+def forecast(
+    trainer: Trainer, *, capacity: int, max_bytes: int, size: int, lags: Sequence[int], done: Counters
+) -> Forecast:
     """Time emulation, acting and learning with a trainer's parts, and restore all but the emulators.
 
     Call it before their episodes begin or are loaded. capacity in observations, max_bytes of the replay memory, size in
@@ -74,7 +76,7 @@ def forecast(trainer: Trainer, *, capacity: int, max_bytes: int, size: int, stac
     plan, learner, emulators = trainer.plan, trainer.learner, trainer.emulators
     num_envs = emulators.num_envs
     rng = np.random.default_rng(0)
-    memory = ReplayMemory(4_096, (size, size), stack=stack, budget_bytes=4_096 * size * size)
+    memory = ReplayMemory(8_192, (size, size), lags=lags, budget_bytes=8_192 * size * size)
     for env, observation in enumerate(emulators.reset(range(num_envs), [0] * num_envs)):
         memory.begin(env, observation)
     sampler = copy.deepcopy(plan.phases[0].sampler)
@@ -95,7 +97,7 @@ def forecast(trainer: Trainer, *, capacity: int, max_bytes: int, size: int, stac
 
     with learner.restored():
         play_seconds = _median_seconds(play, at_least=8, seconds=1.0)
-        states = np.zeros((num_envs, stack, size, size), np.uint8)
+        states = np.zeros((num_envs, len(lags), size, size), np.uint8)
         act_seconds = _median_seconds(lambda: learner.q_values(states), at_least=3, seconds=0.5)
         update_seconds = _median_seconds(update, at_least=3, seconds=1.0)
     emulators.reset(range(num_envs), [0] * num_envs)  # a fresh console

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from atlantis_exp.build import make_emulator
+from atlantis_exp.sessions.cards import read_card
 from benchmarks import (
     emulation,
     evaluation,
@@ -332,3 +334,24 @@ def test_the_pace_of_a_game_is_that_of_its_points(capsys: pytest.CaptureFixture[
     assert results["hits_a_thousand_frames"] > 0
     assert results["share_of_steps_in_lane"][0] > results["share_of_steps_in_lane"][3]
     assert 0 < results["share_of_steps_without_a_ship"] < 1
+
+
+def test_a_gap_belongs_to_the_dearest_hit_of_the_step_before_it() -> None:
+    points = [[0, 0, 0, 0, 0], [100, 0, 0, 0, 0], [0, 200, 1_000, 0, 0], [0, 0, 0, 0, 500], [0, 0, 0, 2_000, 0]]
+    hits = {"centre_vessel": [3], "side_vessel": [], "centre_bomber": [8], "side_bomber": []}
+    assert pace.gaps([4, 4, 3, 4, 4], points) == hits
+
+
+def test_the_oracle_changes_nothing_by_looking_ahead_and_hits_more_than_chance(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    card, _ = read_card(DOCS.parent / "pretrained" / "cnn_annealed")
+    plain = make_emulator(card.config.env)
+    oracle, blind = pace.Oracle(**plain.keywords), plain()
+    oracle.reset(5)
+    blind.reset(5)
+    for action in (1, 0, 2, 3, 0):
+        assert 0 <= oracle.choose(None) < 4
+        np.testing.assert_equal(oracle.step(action), blind.step(action))
+    hits = [results_of(pace.main, f"--steps 60 {who}", capsys)["hits"] for who in ("--oracle", "--epsilon 1")]
+    assert sum(hits[0].values()) > sum(hits[1].values())

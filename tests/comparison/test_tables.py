@@ -79,7 +79,9 @@ def played(actor: int, frames: int, seed: int) -> EpisodeTable:
         max_pool=False,
     )
     with make_emulators(make, 2, workers=0) as emulators:
-        return evaluate(RandomActor(actor), emulators, episodes=2, epsilon=0.0, seed=seed, size=32, stack=4).table()
+        return evaluate(
+            RandomActor(actor), emulators, episodes=2, epsilon=0.0, seed=seed, size=32, lags=range(4)
+        ).table()
 
 
 def with_table(recorded: Recorded, table: EpisodeTable, *overrides: str) -> None:

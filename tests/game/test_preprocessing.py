@@ -153,21 +153,21 @@ operations = st.lists(
 
 
 @settings(max_examples=60)
-@given(operations=operations, depth=st.integers(1, 4))
+@given(operations=operations, lags=st.sets(st.integers(1, 6), max_size=3).map(lambda lags: (0, *sorted(lags))))
 def test_a_frame_stack_equals_lists_of_whole_histories(
-    operations: list[tuple[str, list[int], int]], depth: int
+    operations: list[tuple[str, list[int], int]], lags: tuple[int, ...]
 ) -> None:
-    stack = FrameStack(3, 2, depth)
-    histories = [[0] * depth for _ in range(3)]
+    stack = FrameStack(3, 2, lags)
+    histories = [[0] * 7 for _ in range(3)]
     handed_out = []
     for value, (operation, order, count) in enumerate(operations, start=1):
         envs = tuple(order[:count])
         if operation == "reset":
             stack.reset(envs, frames(*(10 * value + env for env in envs)))
             for env in envs:
-                histories[env] = [10 * value + env] * depth
+                histories[env] = [10 * value + env] * 7
         elif operation == "restore":
-            restored = FrameStack(3, 2, depth)
+            restored = FrameStack(3, 2, lags)
             restored.load_state_dict(stack.state_dict())
             stack = restored
         else:
@@ -177,7 +177,7 @@ def test_a_frame_stack_equals_lists_of_whole_histories(
             observations[:] = 255
             for env in envs:
                 histories[env].append(10 * value + env)
-        handed_out.append((stack.state, [history[-depth:] for history in histories]))
+        handed_out.append((stack.state, [[history[-1 - lag] for lag in reversed(lags)] for history in histories]))
     for state, expected in handed_out:
         assert state[:, :, 0, 0].tolist() == expected
         assert state[:, :, 1, 1].tolist() == expected

@@ -93,7 +93,7 @@ def test_returns_over_n_steps_are_torchrl_s(n_step: int) -> None:
     terminated, truncated = rng.random(length) < 0.1, rng.random(length) < 0.1
     truncated &= ~terminated
     done = terminated | truncated
-    memory = ReplayMemory(2 * length, (2, 2), stack=1, budget_bytes=1 << 20)
+    memory = ReplayMemory(2 * length, (2, 2), lags=[0], budget_bytes=1 << 20)
     # An episode's first observation is 2k, the one after step k is 2k + 1.
     before = np.where(np.insert(done[:-1], 0, True), 2 * np.arange(length), 2 * np.arange(length) - 1)
     after = 2 * np.arange(length) + 1

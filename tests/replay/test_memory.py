@@ -1,6 +1,6 @@
 """Transitions by id against whole stacks kept in a list."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -45,17 +45,23 @@ CAPACITIES = st.integers(5, 40)
 NOISE_BUDGETS = st.sampled_from([9, 12, 1_000])  # frames of noise
 
 
-def memory_of(capacity: int, noise_frames: int = 1_000, stack: int = 4) -> ReplayMemory:
-    return ReplayMemory(capacity, SHAPE, stack=stack, budget_bytes=23 * capacity + 46 * noise_frames)
+LAGS = st.one_of(
+    st.integers(1, 4).map(range),
+    st.sets(st.integers(1, 12), max_size=4).map(lambda lags: (0, *sorted(lags))),
+)
+
+
+def memory_of(capacity: int, noise_frames: int = 1_000, lags: Sequence[int] = range(4)) -> ReplayMemory:
+    return ReplayMemory(capacity, SHAPE, lags=lags, budget_bytes=23 * capacity + 46 * noise_frames)
 
 
 @dataclass
 class Oracle:
     """Keeps every transition whole, for ever, with the ids of the observations it is made of."""
 
-    stack: int = 4
+    lags: Sequence[int] = range(4)
     num_observations: int = 0
-    states: dict[int, list[tuple[int, Frame]]] = field(default_factory=dict)
+    episodes: dict[int, list[tuple[int, Frame]]] = field(default_factory=dict)  # each environment's latest, whole
     transitions: dict[int, tuple[set[int], list[Frame], int, float, list[Frame], bool]] = field(default_factory=dict)
     successors: dict[int, int] = field(default_factory=dict)  # of a state's newest observation
 
@@ -65,13 +71,14 @@ class Oracle:
         if event.noise:
             observation = np.random.default_rng(k).integers(0, 256, SHAPE, np.uint8)
         self.num_observations += 1
-        if event.begins or event.env not in self.states:
+        if event.begins or event.env not in self.episodes:
             memory.begin(event.env, observation)
-            self.states[event.env] = [(k, observation)] * self.stack
+            self.episodes[event.env] = [(k, observation)]
             return
         memory.add(event.env, event.action, event.reward, observation, event.terminal)
-        state = self.states[event.env]
-        next_state = [*state[1:], (k, observation)]
+        state = self.state(event.env)
+        self.episodes[event.env] = [*self.episodes[event.env], (k, observation)]
+        next_state = self.state(event.env)
         self.transitions[state[-1][0]] = (
             {of for of, _ in state + next_state},
             [frame for _, frame in state],
@@ -81,7 +88,11 @@ class Oracle:
             event.terminal,
         )
         self.successors[state[-1][0]] = k
-        self.states[event.env] = next_state
+
+    def state(self, env: int) -> list[tuple[int, Frame]]:
+        """Look up what was seen each of so many steps ago; before an episode is its first observation."""
+        seen = self.episodes[env]
+        return [seen[max(0, len(seen) - 1 - lag)] for lag in reversed(self.lags)]
 
     def available(self, oldest_id: int) -> list[int]:
         return sorted(k for k, (needs, *_) in self.transitions.items() if min(needs) >= oldest_id)
@@ -143,7 +154,7 @@ def available_ids(memory: ReplayMemory) -> npt.NDArray[np.int64]:
 @given(
     capacity=CAPACITIES,
     noise_frames=NOISE_BUDGETS,
-    stack=st.integers(1, 4),
+    lags=LAGS,
     events=EVENTS,
     returns=st.builds(
         Returns,
@@ -154,9 +165,10 @@ def available_ids(memory: ReplayMemory) -> npt.NDArray[np.int64]:
     ),
 )
 def test_the_memory_is_the_newest_part_of_a_list_of_whole_transitions(
-    capacity: int, noise_frames: int, stack: int, events: list[Event], returns: Returns
+    capacity: int, noise_frames: int, lags: Sequence[int], events: list[Event], returns: Returns
 ) -> None:
-    memory, oracle = memory_of(capacity, noise_frames, stack), Oracle(stack)
+    capacity = max(capacity, lags[-1] + 2)
+    memory, oracle = memory_of(capacity, noise_frames, lags), Oracle(lags)
     for event in events:
         oracle.feed(memory, event)
         memory.check_valid()
@@ -174,17 +186,39 @@ def test_the_memory_is_the_newest_part_of_a_list_of_whole_transitions(
             assert sorted(memory.completed(since)) == [k for k in ids if oracle.successors[k] >= since]
 
 
+@pytest.mark.parametrize("returns", [ONE_STEP, Returns(0.9, n_step=3)])
+@pytest.mark.parametrize("lags", [range(4), (0, 3), (0, 1, 2, 7)])
+def test_a_full_memory_forgets_a_state_with_its_oldest_observation(lags: Sequence[int], returns: Returns) -> None:
+    memory, oracle, rng = memory_of(30, lags=lags), Oracle(lags), np.random.default_rng(0)
+    for step in range(200):
+        begins, ends = rng.random(2) < 0.05
+        oracle.feed(memory, Event(int(rng.integers(2)), bool(begins), step % 4, float(step), bool(ends), step % 3 == 0))
+        memory.check_valid()
+        ids = oracle.available(memory.oldest_id)
+        assert len(memory) == len(ids)
+        if ids:
+            assert_same_transitions(memory.gather(np.array(ids), returns), oracle.gather(ids, returns))
+    assert len(ids) >= 10
+
+
 @given(
     capacity=CAPACITIES,
     noise_frames=NOISE_BUDGETS,
+    lags=LAGS,
     events=EVENTS,
     later=EVENTS,
     commits=st.sets(st.integers(0, 80)),
 )
 def test_a_memory_restored_from_segments_is_and_remains_the_unbroken_one(
-    capacity: int, noise_frames: int, events: list[Event], later: list[Event], commits: set[int]
+    capacity: int,
+    noise_frames: int,
+    lags: Sequence[int],
+    events: list[Event],
+    later: list[Event],
+    commits: set[int],
 ) -> None:
-    memory, oracle = memory_of(capacity, noise_frames), Oracle()
+    capacity = max(capacity, lags[-1] + 2)
+    memory, oracle = memory_of(capacity, noise_frames, lags), Oracle(lags)
     segments, written = [], 0
     for i, event in enumerate(events):
         if i in commits:
@@ -200,10 +234,10 @@ def test_a_memory_restored_from_segments_is_and_remains_the_unbroken_one(
                 yield segment
         yield segments[-1]
 
-    restored = played(memory_of(capacity, noise_frames), 30)  # to be forgotten
+    restored = played(memory_of(capacity, noise_frames, lags), 30)  # to be forgotten
     restored.load_segments(still_needed())
     three = Returns(0.9, n_step=3)
-    twin = Oracle(num_observations=oracle.num_observations, states=dict(oracle.states))
+    twin = Oracle(lags, oracle.num_observations, dict(oracle.episodes))
     for i in range(len(later) + 1):
         assert (len(restored), restored.nbytes) == (len(memory), memory.nbytes)
         assert_same_state(restored.state_dict(), memory.state_dict())

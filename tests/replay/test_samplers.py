@@ -123,7 +123,7 @@ def test_prioritized_draws_are_a_naive_sampler_s(
     plays: list[tuple[int, bool, bool]], rounds: list[int], seed: int, reload: bool
 ) -> None:
     """While the memory forgets the oldest, and in between the sampler is restored from its state."""
-    memory = ReplayMemory(16, (4, 4), stack=1, budget_bytes=1 << 20)  # where no state is forgotten by half
+    memory = ReplayMemory(16, (4, 4), lags=[0], budget_bytes=1 << 20)  # where no state is forgotten by half
     sampler, naive, rng = PrioritizedSampler(0.7, 0.5), NaiveSampler(), np.random.default_rng(seed)
     under_way: set[int] = set()
     for count in rounds:

@@ -255,7 +255,9 @@ def test_a_network_as_onnx_says_what_it_says_in_torch(
     command: Command, tiny: Compose, tmp_path: Path, capsys: pytest.CaptureFixture[str], model: str
 ) -> None:
     onnxruntime = pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
-    config = tiny(f"model={model}", "env.size=40", "objective=quantile", "evaluation.at_end=false")
+    config = tiny(
+        f"model={model}", "env.size=40", "env.stack=[0,1,3,8]", "objective=quantile", "evaluation.at_end=false"
+    )
     train(Job(config))
     folder, outputs = tmp_path / "exported", f"paths.outputs={config.paths.outputs}"
     assert command("export", f"to={folder}", "weights=latest", "episodes=1", "onnx=true", outputs) == 0

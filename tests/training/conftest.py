@@ -35,7 +35,7 @@ from atlantis_exp.training.trainer import Trainer
 ATLANTIS = facts_of(game_of("Atlantis-v0"))
 NUM_ACTIONS = len(ATLANTIS.actions)
 SIZE = 8  # pixels
-STACK = 4  # observations
+LAGS = range(4)  # steps ago, of a state's observations
 CAPACITY = 120  # observations
 BUDGET = 2**20  # bytes
 
@@ -74,15 +74,15 @@ class Game:
         self.generator.bit_generator.state, self.played = state["generator"], state["played"]
 
 
-def emulators_of(num_envs: int, steps: int = 40) -> Emulators:
-    return make_emulators(cast(Callable[[], Emulator], partial(Game, steps)), num_envs, 0)
+def emulators_of(num_envs: int, steps: int = 40, game: type[Game] = Game) -> Emulators:
+    return make_emulators(cast(Callable[[], Emulator], partial(game, steps)), num_envs, 0)
 
 
-def learner_of(seed: int = 0, **options: Any) -> Learner:
+def learner_of(seed: int = 0, lags: Sequence[int] = LAGS, **options: Any) -> Learner:
     def network() -> nn.Module:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            return nn.Sequential(nn.Flatten(), nn.Linear(STACK * SIZE * SIZE, NUM_ACTIONS))
+            return nn.Sequential(nn.Flatten(), nn.Linear(len(lags) * SIZE * SIZE, NUM_ACTIONS))
 
     online = network()
     optimizer = torch.optim.AdamW(online.parameters(), 1e-3)
@@ -125,7 +125,7 @@ def small() -> Callable[..., Trainer]:
     """Builds a trainer in a folder and continues from the checkpoint there: `small(tmp_path, num_envs=3)`.
 
     Fields of `Plan` and `Cadence` may be given by their names; episode_steps is an episode's length, capacity the
-    replay memory's in observations, console what is told.
+    replay memory's in observations, console what is told, game what is played.
     """
 
     def built(
@@ -138,29 +138,31 @@ def small() -> Callable[..., Trainer]:
         max_steps: int | None = None,
         max_updates: int | None = None,
         console: Console | None = None,
+        game: type[Game] = Game,
+        lags: Sequence[int] = LAGS,
         **options: Any,
     ) -> Trainer:
         plan = Plan(**{**vars(PLAN), **_taken(options, Plan)})
         cadence = Cadence(**{**vars(CADENCE), **_taken(options, Cadence)})
         assert not options, options
         exploration, sampling, emulation = np.random.SeedSequence(seed).spawn(3)
-        learner = learner_of(seed)
-        memory = ReplayMemory(capacity, (SIZE, SIZE), stack=STACK, budget_bytes=BUDGET)
+        learner = learner_of(seed, lags)
+        memory = ReplayMemory(capacity, (SIZE, SIZE), lags=lags, budget_bytes=BUDGET)
         evaluator = Evaluator(
             most_frames=1_000,
-            make_emulators=partial(emulators_of, steps=episode_steps),
-            make_emulator=cast(Callable[[], Emulator], Game),
+            make_emulators=partial(emulators_of, steps=episode_steps, game=game),
+            make_emulator=cast(Callable[[], Emulator], game),
             epsilon=0.05,
             seed=1_000_003,
             num_envs=1,
             size=SIZE,
-            stack=STACK,
+            lags=lags,
             video=None,
         )
         trainer = Trainer(
             plan=plan,
-            emulators=emulators_of(num_envs, episode_steps),
-            stack=FrameStack(num_envs, SIZE, STACK),
+            emulators=emulators_of(num_envs, episode_steps, game),
+            stack=FrameStack(num_envs, SIZE, lags),
             actor=EpsilonGreedy(learner.q_values, NUM_ACTIONS),
             memory=memory,
             learner=learner,
@@ -180,7 +182,7 @@ def small() -> Callable[..., Trainer]:
             ),
             checkpoints=Checkpoints(folder / "checkpoints", "small"),
             max_steps=max_steps,
-            max_flops=None if max_updates is None else max_updates * learner.update_flops((STACK, SIZE, SIZE), 4),
+            max_flops=None if max_updates is None else max_updates * learner.update_flops((len(lags), SIZE, SIZE), 4),
         )
         if (state := trainer.checkpoints.load(trainer.memory)) is not None:
             trainer.load_state_dict(state)

@@ -23,7 +23,7 @@ GAME = replace(facts_of(game_of("Atlantis-v0")), sources=())
 def played(tiny: Compose) -> Callable[..., Evaluation]:
     def play(num_envs: int, actor: Actor | None = None, **chosen: float) -> Evaluation:
         env = tiny("env.max_steps=25").env
-        settings = {"episodes": 4, "epsilon": 0.5, "seed": 5, "size": env.size, "stack": env.stack, **chosen}
+        settings = {"episodes": 4, "epsilon": 0.5, "seed": 5, "size": env.size, "lags": env.lags, **chosen}
         with make_emulators(make_emulator(env), num_envs, workers=0) as emulators:
             return evaluate(actor or RandomActor(4), emulators, **settings)  # type: ignore[arg-type]
 
@@ -91,7 +91,7 @@ def test_the_actor_decides_for_one_half_while_the_other_is_emulated(
         watch(emulators, "reset")
         watch(emulators, "send")
         watch(emulators, "receive")
-        evaluate(Watched(4), emulators, episodes=6, epsilon=0.5, seed=5, size=env.size, stack=env.stack)
+        evaluate(Watched(4), emulators, episodes=6, epsilon=0.5, seed=5, size=env.size, lags=env.lags)
     next_of_three, next_of_two = ["receive", "decide 3", "send"], ["receive", "decide 2", "send"]
     the_sixth_episode = ["receive", "decide 1", "send"]  # on environment 0, while the others have none left
     assert tape == [
@@ -170,9 +170,7 @@ def test_a_player_without_a_network_has_no_favourite(played: Callable[..., Evalu
 def test_the_score_is_split_by_what_paid_it(tiny: Compose) -> None:
     env = tiny("env.max_steps=700").env
     with make_emulators(make_emulator(env), 2, workers=0) as emulators:
-        evaluation = evaluate(
-            RandomActor(4), emulators, episodes=2, epsilon=0.0, seed=5, size=env.size, stack=env.stack
-        )
+        evaluation = evaluate(RandomActor(4), emulators, episodes=2, epsilon=0.0, seed=5, size=env.size, lags=env.lags)
     emulator = make_emulator(env)()
     sources = emulator.game.sources
     totals = dict.fromkeys(sources, 0.0)

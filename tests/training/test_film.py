@@ -28,7 +28,7 @@ def played(tiny: Compose) -> Callable[..., Episode]:
         env = tiny("env.max_steps=25").env
         with build_emulators(env, 1, 1) as emulators:
             player = actor or RandomActor(4)
-            return evaluate(player, emulators, episodes=4, epsilon=0.5, seed=5, size=env.size, stack=env.stack).best
+            return evaluate(player, emulators, episodes=4, epsilon=0.5, seed=5, size=env.size, lags=env.lags).best
 
     return play
 
@@ -63,7 +63,7 @@ def test_the_values_in_a_film_are_those_that_the_network_decided_by(
     assert 0 < len(decided) < len(filmed)
     assert all(moment.q_values is not None for moment in filmed)
     assert [moment.action for moment in decided] == [int(moment.q_values.argmax()) for moment in decided]  # type: ignore[union-attr]
-    observations = FrameStack(1, 40, 4)
+    observations = FrameStack(1, 40)
     observations.reset([0], emulator.reset(episode.seed)[np.newaxis])
     for moment in filmed:
         np.testing.assert_array_equal(learner.q_values(observations.state)[0], moment.q_values)

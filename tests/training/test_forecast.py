@@ -34,7 +34,7 @@ def timed(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
 
 def expected_of(trainer: Trainer, size: int, **chosen: Any) -> Forecast:
     asked = {"capacity": 120, "max_bytes": 2**22, "done": trainer.counters}
-    return forecast(trainer, size=size, stack=4, **{**asked, **chosen})
+    return forecast(trainer, size=size, lags=range(4), **{**asked, **chosen})
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])

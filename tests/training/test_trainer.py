@@ -2,7 +2,7 @@ import dataclasses
 import itertools
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -130,7 +130,7 @@ def test_the_same_seed_gives_the_same_training_and_another_seed_another(small: S
             (
                 *("model=resnet", "env.size=16", "env.num_envs=3", "env.workers=2", "optimizer=rmsprop"),
                 *("objective.target.mode=train", "objective=double_dqn", "sampler=prioritized"),
-                *("phase.quick.sampler=prioritized", "phase.second.sampler=prioritized"),
+                *("phase.quick.sampler=prioritized", "phase.second.sampler=prioritized", "env.stack=[0,1,5,9]"),
             ),
             marks=pytest.mark.slow,
         ),
@@ -414,11 +414,11 @@ def test_a_run_that_ends_where_it_was_evaluated_in_passing_is_evaluated_in_full(
     assert curve(tmp_path, "evaluation/episodes") == [(80, 1), (80, 2)]
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize(("num_envs", "lags"), [(1, range(4)), (3, (0, 2, 9))])
 def test_a_training_ends_at_the_first_step_at_which_its_updates_are_made_and_is_resumed_bit_for_bit(
-    small: Small, tmp_path: Path, num_envs: int
+    small: Small, tmp_path: Path, num_envs: int, lags: Sequence[int]
 ) -> None:
-    asked = {"num_envs": num_envs, "max_updates": 11}
+    asked = {"num_envs": num_envs, "lags": lags, "max_updates": 11}
     unbroken = small(tmp_path / "unbroken", **asked)
     before: dict[int, int] = {}  # updates made when a step begins
     assert unbroken.run(lambda: before.setdefault(unbroken.counters.steps, unbroken.learner.updates) < 0) == "budget"

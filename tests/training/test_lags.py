@@ -1,0 +1,88 @@
+"""States with gaps, and a task that is not solved without them: a light shows 20 steps before which action pays."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from rich.console import Console
+
+from atlantis_exp.game.emulator import Step
+from atlantis_exp.learning.schedules import Constant
+from atlantis_exp.replay.memory import Returns
+from atlantis_exp.replay.samplers import UniformSampler
+from atlantis_exp.training.actor import Decisions
+from atlantis_exp.training.plan import Phase
+from atlantis_exp.training.progress import Progress
+from atlantis_exp.training.trainer import Trainer
+from tests.training.conftest import SIZE, Game
+
+LIT, CHOICE = 2, 22  # steps of an episode
+
+
+class Cue(Game):
+    """Dark but for a light on the left or the right, and a line at the top where the choice is due."""
+
+    def reset(self, seed: int | None = None) -> npt.NDArray[np.uint8]:
+        if seed is not None:
+            self.generator = np.random.default_rng(seed)
+        self.played, self.pays = 0, int(self.generator.integers(2))
+        return self.screen()
+
+    def step(self, action: int) -> Step:
+        over = self.played == CHOICE
+        reward = float(over and action == self.pays)
+        self.played += 1
+        return Step(self.screen(), reward, over, False, False, 4, [reward, 0.0, 0.0, 0.0, 0.0])
+
+    def screen(self) -> npt.NDArray[np.uint8]:
+        screen = np.zeros((2, SIZE, SIZE // 2), np.uint8)
+        screen[self.pays] = 255 * (self.played == LIT)
+        screen[:, 0] = np.maximum(screen[:, 0], 255 * (self.played == CHOICE))
+        return np.hstack([*screen])
+
+    def state_dict(self) -> dict[str, Any]:
+        return {**super().state_dict(), "pays": self.pays}
+
+
+@pytest.mark.parametrize(("lags", "is_solved"), [((0, 1, 2, 20), True), (range(4), False)])
+def test_a_state_that_reaches_back_to_the_light_solves_what_one_of_as_many_observations_cannot(
+    small: Callable[..., Trainer], tmp_path: Path, lags: Sequence[int], is_solved: bool
+) -> None:
+    trainer = small(
+        tmp_path,
+        num_envs=4,
+        game=Cue,
+        lags=lags,
+        capacity=4_000,
+        phases=[Phase("quick", 4_000, 1e-3, UniformSampler())],
+        epsilon=Constant(1.0),
+        returns=Returns(0.0),
+        batch_size=32,
+        evaluate_steps=None,
+        evaluate_at_end=False,
+    )
+    assert trainer.run() == "finished"
+    share = trainer.recorder.play(100, Progress(Console(quiet=True)), lambda: False).summary.mean
+    assert share > 0.9 if is_solved else 0.3 < share < 0.7
+
+
+def test_a_state_is_the_same_where_it_is_acted_on_and_where_it_is_learned_from(
+    small: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    trainer = small(tmp_path, num_envs=2, lags=(0, 3, 7), capacity=1_000, evaluate_steps=None)
+    acted, act = [], trainer.actor.act
+
+    def watched(states: npt.NDArray[np.uint8], *asked: Any) -> Decisions:
+        acted.append(states)
+        return act(states, *asked)
+
+    trainer.actor = SimpleNamespace(act=watched)
+    trainer.run()
+    ids = np.arange(trainer.memory.next_id)
+    learned = trainer.memory.gather(ids[trainer.memory.available(ids)], Returns(0.9, n_step=5))
+    np.testing.assert_array_equal(learned.s_t, np.concatenate(acted))
+    assert len(learned.s_t) == 160  # in episodes of 40 steps
