@@ -102,7 +102,7 @@ BREACHES = [  # what a part is replaced by, and the contracts that it breaks
             "(DQN):\n    pass",
             "(DQN):\n    def targets(self, r, s, d, online, target):\n        return r + target(s).mean(1)",
         ),
-        ("discount 0",),
+        ("at discount 0",),
     ),
     ('{"drawn": self.drawn}', '{"drawn": 0}', ("continues from its saved state",)),
     ("[:batch_size], None", ", None", ("draws available transitions",)),
