@@ -159,7 +159,7 @@ def needs(config: cfg.Config) -> str:
     lacking = {name: text for name, text in wanted.items() if str(there.get(name)) != text}
     if not lacking:
         return f"env.id={config.env.id}: none of the plugins has this game"
-    given = [f"; {there[name].shown} is {there[name]}, another run" for name in lacking if name in there]
+    given = [f"; {there[name].shown} is {there[name]}, which makes another run" for name in lacking if name in there]
     names = [name if config.plugins[name].version else f"./{name}.py" for name in lacking]
     return f"needs plugins={','.join(names)} ({'; '.join(lacking.values())}){''.join(given)}"
 
