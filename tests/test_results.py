@@ -96,6 +96,17 @@ def test_the_best_player_is_the_last_of_its_training_and_begins_with_the_one_bef
     assert (config.lr_schedule.name, config.replay.capacity) == ("linear", config.budget.steps)
 
 
+def test_the_notebook_has_what_the_greedy_look_ahead_reached() -> None:
+    kept = json.loads((RESULTS / "oracle.json").read_text())
+    rates = (f"{kept['points_a_frame']:.2f}", f"{kept['bonus_a_frame']:.2f}", f"{kept['hits_a_thousand_frames']:.1f}")
+    lanes = ", ".join(f"{100 * share:.0f} %" for share in kept["share_of_steps_in_lane"])
+    empty = f"{100 * kept['share_of_steps_without_a_ship']:.0f} %"
+    assert f"| greedy look-ahead | {' | '.join((*rates, lanes, empty))} |" in text_of(LAB)
+    (lower, median, upper), bomber = (kept["frames_to_the_next_hit"][f"side_{ship}"] for ship in ("vessel", "bomber"))
+    told = f"are {median:.0f} frames (median, quartiles {lower:.0f} and {upper:.0f}), from a bomber hit by one"
+    assert f"{told} {bomber[1]:.0f}." in text_of(LAB)
+
+
 def test_a_training_on_another_device_began_like_the_kept_one() -> None:
     with (REPOSITORY / "docs/data/top_half_on_a_gpu.csv").open() as file:
         printed = [row for row in csv.DictReader(file) if row["kind"] == "training" and row["seed"] == "4"]
