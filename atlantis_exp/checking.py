@@ -122,6 +122,9 @@ def _explain(faults: list[ErrorDetails], tree: Mapping[str, Any]) -> str:
         return str(cause)
     # A misspelt key shows twice, as one missing and one extra: the extra one is the user's.
     fault = min(faults, key=lambda fault: fault["type"] != "unexpected_keyword_argument")
+    above = _locate(fault, tree)[0]
+    within = [other for other in faults if _locate(other, tree)[0][: len(above)] == above]
+    fault = max(within, key=lambda other: len(_locate(other, tree)[0]))  # of a list's items rather than its type
     path, siblings, node = _locate(fault, tree)
     key, kind = ".".join(path), fault["type"]
     if kind == "unexpected_keyword_argument":

@@ -57,7 +57,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("sampler@samplers.foo=uniform", "sampler@samplers.foo", "'sampler@samplers."),
     ("+samplers.mine={name:uniform}", "samplers.mine", "samplers.uniform"),
     ("~optimizer", "~optimizer", "required; write optimizer=VALUE"),
-    ("~plugins=0.5", "~plugins=0.5", "needed"),
+    ("~plugins=0.5", "~plugins=0.5", "required"),
     ("~phase.single", "phase", "at least one phase"),
     ("phase=two_phase ~phase.first.lr", "phase.first.lr", "missing"),
     ("optimizer.lr=${optimizer.l}", "optimizer.l", "'optimizer.lr'"),
@@ -145,7 +145,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("env.max_pool=true", "env.max_pool", "fixed env.frameskip"),
     ("phase=two_phase phase.second.sampler=tophalf", "phase.second.sampler=tophalf", "'top_half'"),
     ("phase.single.steps=5", "phase.single", "either episodes or steps"),
-    ("phase=two_phase phase.first.episodes=null phase.first.steps=9", "phase", "same unit"),
+    ("phase=two_phase phase.first.episodes=null phase.first.steps=9", "phase", "or steps in all"),
     # sweeps and flags
     ("seed=0,1", "seed=0,1", "-m"),
     ("--cfg foo", "--cfg", "job"),
