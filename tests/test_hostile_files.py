@@ -421,12 +421,12 @@ def test_a_forged_checkpoint_is_one_line(change: Callable[[State, ReplayMemory],
     with soon(), pytest.raises(Fault) as refused:
         train(Job(config))
     assert "\n" not in str(refused.value)
-    assert "resume=never" in str(refused.value) or "not of this training" in str(refused.value)
+    assert "resume=never" in str(refused.value) or "does not fit this training" in str(refused.value)
 
 
 def test_what_training_refuses_as_forged_is_not_played_either(forged: Forged) -> None:
     config = forged(FORGERIES["steps without an end"])
-    with pytest.raises(Fault, match="not of this training"):
+    with pytest.raises(Fault, match="does not fit this training"):
         stored_weights(RunFolder.of(config), "latest")
 
 

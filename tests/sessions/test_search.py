@@ -319,7 +319,7 @@ def test_a_run_that_went_on_beyond_the_budget_is_no_result_of_a_search_within_it
         config = job_of(trials, 0).config
         train(Job(dataclasses.replace(config, budget=dataclasses.replace(config.budget, steps=None))))
         trials.train(trial, StopRequest())
-    assert "was trained for 80 steps already" in trials.all[0].user_attrs["error"]
+    assert "already trained for 80 steps" in trials.all[0].user_attrs["error"]
 
 
 def test_a_name_is_one_searchs(searching: Searching) -> None:
