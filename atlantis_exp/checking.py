@@ -120,12 +120,11 @@ def _explain(faults: list[ErrorDetails], tree: Mapping[str, Any]) -> str:
     """Return one line for the first fault of a tree, or for an unknown key if there is one."""
     if isinstance(cause := faults[0].get("ctx", {}).get("error"), ConfigError):
         return str(cause)
+    located = [(fault, *_locate(fault, tree)) for fault in faults]
     # A misspelt key shows twice, as one missing and one extra: the extra one is the user's.
-    fault = min(faults, key=lambda fault: fault["type"] != "unexpected_keyword_argument")
-    above = _locate(fault, tree)[0]
-    within = [other for other in faults if _locate(other, tree)[0][: len(above)] == above]
-    fault = max(within, key=lambda other: len(_locate(other, tree)[0]))  # of a list's items rather than its type
-    path, siblings, node = _locate(fault, tree)
+    _, above, *_ = min(located, key=lambda each: each[0]["type"] != "unexpected_keyword_argument")
+    within = [each for each in located if each[1][: len(above)] == above]
+    fault, path, siblings, node = max(within, key=lambda each: len(each[1]))  # of a list's items rather than its type
     key, kind = ".".join(path), fault["type"]
     if kind == "unexpected_keyword_argument":
         return f"{key}: no such key; {nearest(path[-1], set(siblings) - {path[-1]})}"
@@ -139,7 +138,7 @@ def _explain(faults: list[ErrorDetails], tree: Mapping[str, Any]) -> str:
         choices = str(fault["ctx"]["expected"]).replace("'", "").replace(" or ", ", ").split(", ")
         return f"{key}={node}: no such choice; {nearest(str(node), choices)}"
     # A union has a fault for each of its types.
-    here = [other for other in faults if _locate(other, tree)[0] == path]
+    here = [other for other, place, *_ in located if place == path]
     is_whole = isinstance(node, float) and node.is_integer() and abs(node) < 2**63
     if is_whole and any(other["type"] == "int_type" for other in here):
         return f"{key}={node:g}: should be an integer; write {key}={int(node):_}"
