@@ -23,13 +23,14 @@ from atlantis_exp.game.vector import Emulators, make_emulators
 from atlantis_exp.games import Game
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.learning.process import OWN_THREADS
-from atlantis_exp.learning.values import ActionValues
+from atlantis_exp.learning.recurrent import RecurrentLearner
+from atlantis_exp.learning.values import ActionValues, Recurrent
 from atlantis_exp.networks.dropout import seed_dropout
 from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
-from atlantis_exp.replay.memory import ReplayMemory, Returns
+from atlantis_exp.replay.memory import ReplayMemory, Returns, Window
 from atlantis_exp.runs.folder import CHECKPOINTS
 from atlantis_exp.runs.journal import Tracker
-from atlantis_exp.training.actor import Actor, ConstantActor, EpsilonGreedy, PersonActor, RandomActor
+from atlantis_exp.training.actor import Actor, ConstantActor, EpsilonGreedy, PersonActor, RandomActor, RecurrentGreedy
 from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.evaluator import Evaluator
 from atlantis_exp.training.plan import Cadence, Phase, Plan
@@ -205,14 +206,19 @@ def build_learner(config: cfg.Config) -> Learner:
     target_network = build_network(config, "target", device)
     if target.start == "copy":
         target_network.load_state_dict(network.state_dict())
-    return Learner(
+    make: Callable[..., Learner] = Learner
+    if isinstance(network, Recurrent):
+        if config.compile:
+            raise ConfigError(f"compile=true: model={config.model.name} has a memory; only others can be compiled")
+        make = partial(RecurrentLearner, ahead=config.objective.n_step)
+    return make(
         network,
         target_network,
         build_optimizer(config.optimizer, network),
         build_component(config, config.objective),
         target.tau,
         target_every=target.every,
-        precision=choose_precision(config.training.precision, device),  # type: ignore[arg-type]
+        precision=choose_precision(config.training.precision, device),
         target_mode=target.mode,
         shards=choose_shards(config, device),
         ema=config.training.ema,
@@ -282,6 +288,8 @@ def build_network_actor(config: cfg.Config, weights: bytes, device: str) -> Acto
     network = build_trained_network(config, weights).to(where)
     precision = choose_precision(config.training.precision, where)
     values = ActionValues(network, precision=precision, shards=choose_shards(config, where))  # type: ignore[arg-type]
+    if isinstance(network, Recurrent):
+        return RecurrentGreedy(network.units, values.step, _num_actions(config))
     return EpsilonGreedy(values.q_values, _num_actions(config), watches=True)
 
 
@@ -345,12 +353,18 @@ def build_trainer(
     plan, learner, memory = build_plan(config), build_learner(config), build_memory(config)
     evaluator = build_evaluator(env, config.evaluation, cores)
     cadence, game = build_cadence(config.evaluation, config.tracking), facts_of(config.game)
-    watched = EpsilonGreedy(learner.evaluated_q_values, len(game.actions), watches=True)
+    actor: Actor = EpsilonGreedy(learner.q_values, len(game.actions))
+    watched: Actor = EpsilonGreedy(learner.evaluated_q_values, len(game.actions), watches=True)
+    if isinstance(learner, RecurrentLearner):
+        core = learner.core
+        actor = RecurrentGreedy(core.units, learner.step, len(game.actions))
+        watched = RecurrentGreedy(core.units, learner.evaluated_step, len(game.actions))
+        plan = dataclasses.replace(plan, window=Window(core.burn_in, core.unroll, config.objective.n_step))
     trainer = Trainer(
         plan=plan,
         emulators=make_emulators(evaluator.make_emulator, env.num_envs, env.workers or cores),
-        stack=FrameStack(env.num_envs, env.size, env.lags),
-        actor=EpsilonGreedy(learner.q_values, len(game.actions)),
+        stack=FrameStack(env.num_envs, env.size, env.lags, actor.units),
+        actor=actor,
         memory=memory,
         learner=learner,
         exploration=[np.random.default_rng(child) for child in stream(config.seed, "exploration").spawn(env.num_envs)],

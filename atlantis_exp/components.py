@@ -44,6 +44,8 @@ Share = Annotated[float, Interval(gt=0, lt=1)]
 # Types of settings of built-in classes that need torch or numpy.
 Oversample = Annotated[int, Interval(ge=2, le=64)]
 Quantiles = Annotated[int, Interval(ge=1, le=1_000)]  # an update holds N x N differences per sample
+Units = Annotated[int, Interval(ge=1, le=4_096)]
+Steps = Annotated[int, Interval(ge=1, le=256)]  # an update holds the frames of all
 Rescaling = Literal["signed_sqrt", "symlog"]
 
 
@@ -176,9 +178,11 @@ def describe(name: str, version: str | None, sha256: str) -> str:
 def built_in() -> Mapping[tuple[str, str], Component]:
     """Return the built-in components by kind and name."""
     rescaled: dict[str, Any] = {"rescaling": Rescaling}
+    sequences: dict[str, Any] = {"units": Units, "burn_in": Steps, "unroll": Steps}
     quantiles: dict[str, Any] = {"quantiles": Quantiles, "head": "quantile"}
     ours = [
         _ours("model", "cnn", "networks.cnn.DQNCnn", smallest_side=36, splits_batches=True),
+        _ours("model", "cnn_gru", "networks.cnn_gru.DQNCnnGru", smallest_side=36, splits_batches=True, **sequences),
         _ours("model", "cnn_small", "networks.cnn_small.SmallCnn", smallest_side=20, splits_batches=True),
         _ours("model", "resnet", "networks.resnet.ResNetDQN", smallest_side=15),
         _ours("model", "resnet_fast", "networks.resnet_fast.ResNetFast", smallest_side=8, splits_batches=True),

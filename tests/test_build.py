@@ -135,3 +135,8 @@ def test_an_evaluation_leaves_a_core_to_the_network(
     with build_evaluator(config.env, config.evaluation, cores).make_emulators(4) as emulators:
         assert isinstance(emulators, ProcessEmulators)
         assert len(emulators._processes) == workers
+
+
+def test_a_network_with_a_memory_is_not_compiled(tiny: Callable[..., Config]) -> None:
+    with pytest.raises(ConfigError, match="compile=true: model=cnn_gru has a memory"):
+        build_learner(tiny("model=cnn_gru", "compile=true"))

@@ -207,7 +207,7 @@ def test_twelve_updates_on_the_same_transitions_make_the_same_weights(line: str)
             ids, weights = sampler.sample(memory, plan.batch_size, rng)
             batch = memory.gather(ids, plan.returns)
             batches.update(sha256(ids, *batch).encode())
-            errors = learner.update(*batch, weights)
+            errors = learner.update(*batch, weights=weights)
             if weights is not None:
                 sampler.feed_back(ids, errors.numpy())
         drawn = batches.hexdigest()[:16]

@@ -136,12 +136,13 @@ def test_every_option_of_agent_is_the_player_it_names(option: str) -> None:
 
 @pytest.mark.parametrize("name", options("model"))
 def test_a_config_asks_for_as_many_pixels_as_its_network_needs(name: str) -> None:
-    component = composed(f"model={name}").model.component
+    model = composed(f"model={name}").model
+    component = model.component
     assert component is not None
     network, smallest = component.load(), component.facts["smallest_side"]
-    network((4, smallest, smallest), 4, torch.nn.Linear)
+    network((4, smallest, smallest), 4, torch.nn.Linear, **model.settings)
     with pytest.raises(ValueError, match=f"at least {smallest} pixels"):
-        network((4, smallest - 1, smallest - 1), 4, torch.nn.Linear)
+        network((4, smallest - 1, smallest - 1), 4, torch.nn.Linear, **model.settings)
     with pytest.raises(ConfigError, match=f"needs at least {smallest} pixels|than or equal to {smallest}$"):
         composed(f"model={name}", f"env.size={smallest - 1}")
 

@@ -67,19 +67,23 @@ class FrameStack:
 
     `state` is (num_envs, stack, size, size) uint8. Every change makes a new array, so earlier states never change:
     `stack_frame` of report figure 2.3 shifts in place, which makes every next state equal to its state.
+
+    `memory`, (num_envs, units) float32, is the player's own, who may write to it; an episode begins with zeros.
     """
 
-    def __init__(self, num_envs: int, size: int, lags: Sequence[int] = range(4)) -> None:
+    def __init__(self, num_envs: int, size: int, lags: Sequence[int] = range(4), units: int = 0) -> None:
         self._lags = np.array(lags)[::-1]
         self._ring: Pixels = np.zeros((num_envs, lags[-1] + 1, size, size), np.uint8)  # each environment's newest
         self._newest = np.zeros(num_envs, np.intp)  # each environment's place in it
         self._all = np.arange(num_envs)
         self.state = self._ago(self._all, self._lags)
+        self.memory = np.zeros((num_envs, units), np.float32)
 
     def reset(self, envs: Envs, observations: Pixels) -> Pixels:
         """Begin an episode in `envs` with these observations, (len(envs), size, size); return the state of all."""
         rows = np.asarray(envs, np.intp)
         self._ring[rows] = observations[:, np.newaxis]
+        self.memory[rows] = 0.0
         return self._renew(rows)
 
     def push(self, observations: Pixels, envs: Envs | None = None) -> Pixels:
@@ -90,12 +94,17 @@ class FrameStack:
         return self._renew(rows)
 
     def state_dict(self) -> dict[str, Any]:
-        return {"state": self._ago(self._all, np.arange(self._ring.shape[1])[::-1])}
+        state = self._ago(self._all, np.arange(self._ring.shape[1])[::-1])
+        return {"state": state, **({"memory": self.memory.copy()} if self.memory.size else {})}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         if (state["state"].shape, state["state"].dtype) != (self._ring.shape, np.uint8):
             raise ValueError("the stacks do not have this game's shape")
+        memory = state.get("memory", self.memory)
+        if (memory.shape, memory.dtype) != (self.memory.shape, np.float32) or not np.isfinite(memory).all():
+            raise ValueError("the player's memory is not of its size, or not finite")
         self._ring, self._newest[:] = state["state"].copy(), self._ring.shape[1] - 1
+        self.memory[:] = memory
         self._renew(self._all)
 
     def _renew(self, rows: npt.NDArray[np.intp]) -> Pixels:

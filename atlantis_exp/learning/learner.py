@@ -4,7 +4,7 @@ import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,15 @@ from atlantis_exp.learning.values import ActionValues, Replicas, generators_of
 
 _MEASURES = ("loss", "q", "target", "gradient_norm")
 _AVERAGE_EVERY = 10  # updates, since averaging weights moves as much memory as the optimizer does
+
+
+class Passed(NamedTuple):
+    """The results of a shard's passes, on the device."""
+
+    losses: torch.Tensor  # (B,), with gradients
+    errors: torch.Tensor  # (B,), absolute
+    q: torch.Tensor
+    target: torch.Tensor
 
 
 class Learner(ActionValues):
@@ -87,24 +96,18 @@ class Learner(ActionValues):
             replicas.refresh()
         self._has_begun_with = True
 
-    def update(
-        self,
-        s_t: npt.NDArray[np.uint8],
-        a_t: npt.NDArray[np.integer],
-        r_t: npt.NDArray[np.floating],
-        s_tpm: npt.NDArray[np.uint8],
-        discount: npt.NDArray[np.floating],
-        weights: npt.NDArray[np.floating] | None = None,
-    ) -> torch.Tensor:
+    def update(self, *batch: npt.NDArray[Any], weights: npt.NDArray[np.floating] | None = None) -> torch.Tensor:
         """Take one optimizer step on a batch of transitions, then update target and average if due.
 
-        States (B, C, H, W) in 0..255; actions, rewards and discounts (B,), as `Objective` needs them; weights (B,) of
-        the samples in the loss. Returns absolute TD errors (B,), on the device.
+        batch: s_t, a_t, r_t, s_tpm and discount: states (B, C, H, W) in 0..255; actions, rewards and discounts (B,), as
+        `Objective` needs them. weights: (B,), of the samples in the loss.
+
+        Returns absolute TD errors (B,), on the device.
         """
+        size = len(batch[0])
         if weights is None:
-            weights = np.ones(len(a_t), np.float32)
-        shards = self._shards(s_t, a_t, r_t, s_tpm, discount, weights)
-        parts = self._map_shards(partial(self._gradients, len(a_t)), shards)
+            weights = np.ones(size, np.float32)
+        parts = self._map_shards(partial(self._gradients, size), self._shards(weights, *batch))
         gradients, means, errors = zip(*parts, strict=True)
         for parameter, gradient in zip(_learned(self.network), _summed(gradients), strict=True):
             parameter.grad = gradient
@@ -130,39 +133,43 @@ class Learner(ActionValues):
             self._evaluated.refresh()
 
     def _gradients(
-        self,
-        batch_size: int,
-        shard: int,
-        s_t: npt.NDArray[np.uint8],
-        a_t: npt.NDArray[np.integer],
-        r_t: npt.NDArray[np.floating],
-        s_tpm: npt.NDArray[np.uint8],
-        discount: npt.NDArray[np.floating],
-        weights: npt.NDArray[np.floating],
+        self, batch_size: int, shard: int, weights: npt.NDArray[np.floating], *batch: npt.NDArray[Any]
     ) -> tuple[list[torch.Tensor], torch.Tensor, torch.Tensor]:
         """Return a shard's part of the float32 gradients, of the mean loss, value and target, and of the errors."""
-        online, target_network = self._online_passes[shard], self._target_passes[shard]
-        actions = self._sent(a_t).to(torch.int64)
-        rewards, discounts, importance = (self._sent(array).to(torch.float32) for array in (r_t, discount, weights))
-
-        with torch.no_grad():
-            target = self.objective.targets(
-                rewards, self._input(s_tpm), discounts, lambda s: online(s).float(), lambda s: target_network(s).float()
-            )
-        online.train()
-        q = online(self._input(s_t)).float()
-        online.eval()
-        losses = self.objective.losses(q, actions, target)
-        loss = (losses * importance).sum() / batch_size
+        online = self._online_passes[shard]
+        passed = self._passes(online, self._target_passes[shard], *batch)
+        loss = (passed.losses * self._floats(weights)).sum() / batch_size
         online.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         gradients = [
             torch.zeros_like(parameter, dtype=torch.float32) if parameter.grad is None else parameter.grad.float()
             for parameter in _learned(online)
         ]
-        q, share = q.detach(), len(a_t) / batch_size
-        means = torch.stack((loss.detach(), share * q.mean(), share * target.mean()))
-        return gradients, means, td_errors(q, actions, target)
+        share = len(weights) / batch_size
+        means = torch.stack((loss.detach(), share * passed.q.mean(), share * passed.target.mean()))
+        return gradients, means, passed.errors
+
+    def _passes(self, online: nn.Module, target_network: nn.Module, *batch: npt.NDArray[Any]) -> Passed:
+        """Pass a shard through both networks, with gradients in the losses alone."""
+        s_t, a_t, r_t, s_tpm, discount = batch
+        actions = self._sent(a_t).to(torch.int64)
+        with torch.no_grad():
+            target = self.objective.targets(
+                self._floats(r_t),
+                self._input(s_tpm),
+                self._floats(discount),
+                lambda s: online(s).float(),
+                lambda s: target_network(s).float(),
+            )
+        online.train()
+        q = online(self._input(s_t)).float()
+        online.eval()
+        losses = self.objective.losses(q, actions, target)
+        q = q.detach()
+        return Passed(losses, td_errors(q, actions, target), q, target)
+
+    def _floats(self, array: npt.NDArray[Any]) -> torch.Tensor:
+        return self._sent(array).to(torch.float32)
 
     def evaluated_q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
         """Return the values (B, A) that `evaluated` gives states (B, C, H, W) in 0..255; change nothing."""
@@ -194,11 +201,14 @@ class Learner(ActionValues):
         passes = self._online_passes, self._target_passes
         # The counter sees neither other threads nor compiled networks.
         self._online_passes, self._target_passes = self._online.networks, self._target.networks
-        states, zeros = np.zeros((2, *state), np.uint8), np.zeros(2, np.float32)
         with self.restored(), FlopCounterMode(display=False) as counter:
-            self._gradients(2, 0, states, np.zeros(2, np.int64), zeros, states, zeros, zeros)
+            self._gradients(2, 0, np.zeros(2, np.float32), *self._two_samples(state))
         self._online_passes, self._target_passes = passes
         return int(counter.get_total_flops() * batch_size // 2)
+
+    def _two_samples(self, state: tuple[int, int, int]) -> tuple[npt.NDArray[Any], ...]:
+        states, zeros = np.zeros((2, *state), np.uint8), np.zeros(2, np.float32)
+        return states, np.zeros(2, np.int64), zeros, states, zeros
 
     def statistics(self) -> dict[str, float]:
         """Return the means over the updates since the last call, empty without updates; wait for the device.

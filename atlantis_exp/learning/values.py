@@ -4,7 +4,7 @@ import copy
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
 import cv2
 import numpy as np
@@ -22,6 +22,24 @@ def generators_of(network: nn.Module) -> Iterator[tuple[str, torch.Generator]]:
     for name, module in network.named_modules():
         if isinstance(generator := getattr(module, "generator", None), torch.Generator):
             yield name, generator
+
+
+@runtime_checkable
+class Recurrent(Protocol):
+    """A network with a memory (B, units), which is zero when an episode begins."""
+
+    units: int
+    burn_in: int  # steps before those to learn, which only recompute the memory
+    unroll: int  # steps to learn at once
+
+    def sequence(
+        self, x_BTCHW: torch.Tensor, h_BU: torch.Tensor, first_B: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the values (B, T, A), or quantiles (B, T, A, N), of T states, and the memory after them.
+
+        The memory is zero before step `first` of a sequence.
+        """
+        ...
 
 
 class Replicas:
@@ -86,6 +104,27 @@ class ActionValues:
         q = replicas.networks[shard](self._input(states)).float()
         values: npt.NDArray[np.float32] = action_values(q).cpu().numpy()
         return values
+
+    def step(
+        self, states: npt.NDArray[np.uint8], memory: npt.NDArray[np.float32]
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        """Return a recurrent network's values (B, A) of states and its memory (B, units) after them."""
+        return self.all_steps(self._online, states, memory)
+
+    def all_steps(
+        self, replicas: Replicas, states: npt.NDArray[np.uint8], memory: npt.NDArray[np.float32]
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        parts = self._map_shards(partial(self._step, replicas), self._shards(states, memory))
+        values, after = zip(*parts, strict=True)
+        return np.concatenate(values), np.concatenate(after)
+
+    @torch.inference_mode()
+    def _step(
+        self, replicas: Replicas, shard: int, states: npt.NDArray[np.uint8], memory: npt.NDArray[np.float32]
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        x_B1CHW, never_B = self._input(states).unsqueeze(1), torch.full((len(states),), -1, device=self.device)
+        q, after = replicas.networks[shard].sequence(x_B1CHW, self._sent(memory), never_B)  # type: ignore[operator]
+        return action_values(q[:, 0].float()).cpu().numpy(), after.float().cpu().numpy()
 
     def _shards(self, *batch: npt.NDArray[Any]) -> list[tuple[npt.NDArray[Any], ...]]:
         """Split the arrays of a batch into non-empty shards."""

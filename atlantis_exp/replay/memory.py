@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,6 +52,28 @@ class Transitions(NamedTuple):
     r_t: npt.NDArray[np.float32]  # (B,), the discounted sum of m rewards
     s_tpm: npt.NDArray[np.uint8]  # (B, stack, H, W)
     discount: npt.NDArray[np.float32]  # (B,), of the value of s_tpm: gamma**m, 0 after a terminal step
+
+
+class Window(NamedTuple):
+    """The states that an update of a network with a memory sees: T = burn_in + unroll + ahead."""
+
+    burn_in: int  # steps that only recompute the network's memory
+    unroll: int  # steps to learn
+    ahead: int  # steps after the last, for its n-step return
+
+
+class Sequences(NamedTuple):
+    """A batch of B sequences of T states, of which L follow a burn-in and are learned.
+
+    Where an episode, or what is stored of it, begins within the sequence, its first transition fills the places before.
+    """
+
+    states: npt.NDArray[np.uint8]  # (B, T, stack, H, W)
+    first: npt.NDArray[np.int64]  # (B,), index of the first state that fills no place
+    a_t: npt.NDArray[np.int64]  # (B, L)
+    r_t: npt.NDArray[np.float32]  # (B, L), the discounted sum of m rewards
+    m: npt.NDArray[np.int64]  # (B, L), steps to the state that is valued next
+    discount: npt.NDArray[np.float32]  # (B, L), of its value: gamma**m, 0 after a terminal step
 
 
 class ReplayMemory:
@@ -156,6 +179,37 @@ class ReplayMemory:
 
     def gather(self, ids: npt.NDArray[np.int64], returns: Returns) -> Transitions:
         """Return transitions. Raises: ValueError if one is not available."""
+        a_t, r_t, _, discount, last = self._steps(ids, returns)
+        now, then = self._state(ids), self._state(last)
+        # Two states one step apart share all frames but one, if they have no gaps.
+        overlap = returns.n_step == 1 and len(self.lags) == self._reach + 1
+        frames = self._frames.decode(np.vstack((now, then[-1:] if overlap else then)))
+        s_t, s_tpm = frames[: len(self.lags)].swapaxes(0, 1), frames[-len(self.lags) :].swapaxes(0, 1)
+        return Transitions(s_t, a_t, r_t, s_tpm, discount)
+
+    def gather_sequences(self, ids: npt.NDArray[np.int64], returns: Returns, window: Window) -> Sequences:
+        """Return the sequences whose last learned transitions have these ids.
+
+        Raises: ValueError if one is not available.
+        """
+        chain = [ids]  # newest first
+        for _ in range(window.burn_in + window.unroll - 1):
+            previous = chain[-1] - self._back[chain[-1] % self.capacity]
+            chain.append(np.where(self.available(previous), previous, chain[-1]))
+        chain.reverse()
+        first = sum(((a == b).astype(np.int64) for a, b in pairwise(chain)), np.zeros(len(ids), np.int64))
+        learned = np.stack(chain[window.burn_in :], axis=1)
+        steps = self._steps(learned.ravel(), returns)
+        a_t, r_t, m, discount, _ = (each.reshape(learned.shape) for each in steps)
+        for _ in range(window.ahead):
+            chain.append(chain[-1] + self._forward[chain[-1] % self.capacity])
+        observations = self._state(np.concatenate(chain)).reshape(len(self.lags), len(chain), len(ids))
+        needed, place = np.unique(observations.transpose(2, 1, 0), return_inverse=True)
+        states = self._frames.decode(needed)[place.reshape(len(ids), len(chain), len(self.lags))]
+        return Sequences(states, first, a_t, r_t, m, discount)
+
+    def _steps(self, ids: npt.NDArray[np.int64], returns: Returns) -> tuple[npt.NDArray[Any], ...]:
+        """Return the action of each transition, its rewards' sum, their number, its discount and its last id."""
         first = last = self._successors(ids)
         r_t = returns.reward(self._reward[first % self.capacity])
         steps = np.ones(len(ids), np.int64)
@@ -166,18 +220,10 @@ class ReplayMemory:
             reward = returns.reward(self._reward[last % self.capacity])
             r_t += np.where(forward > 0, returns.gamma**steps * reward, 0.0)
             steps += forward > 0
-        now, then = self._state(ids), self._state(last)
-        # Two states one step apart share all frames but one, if they have no gaps.
-        overlap = returns.n_step == 1 and len(self.lags) == self._reach + 1
-        frames = self._frames.decode(np.vstack((now, then[-1:] if overlap else then)))
         terminal = self._terminal[last % self.capacity]
-        return Transitions(
-            s_t=frames[: len(self.lags)].swapaxes(0, 1),
-            a_t=self._action[first % self.capacity].astype(np.int64),
-            r_t=r_t.astype(np.float32),
-            s_tpm=frames[-len(self.lags) :].swapaxes(0, 1),
-            discount=np.where(terminal, 0.0, returns.gamma**steps).astype(np.float32),
-        )
+        discount = np.where(terminal, 0.0, returns.gamma**steps).astype(np.float32)
+        a_t = self._action[first % self.capacity].astype(np.int64)
+        return a_t, r_t.astype(np.float32), steps, discount, last
 
     def segment(self, since: int) -> dict[str, Any]:
         """Return the entries since id `since` for a checkpoint. Raises: ValueError if that lies in the future."""

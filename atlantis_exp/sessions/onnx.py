@@ -16,7 +16,7 @@ from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.learning.objectives import action_values
-from atlantis_exp.learning.values import ActionValues
+from atlantis_exp.learning.values import ActionValues, Recurrent
 
 Values = npt.NDArray[np.float32]  # (states, actions)
 _TOLERANCE = 1e-4  # of the largest value, between float32 in torch and in ONNX Runtime
@@ -50,9 +50,12 @@ def require() -> None:
 def export_onnx(config: Config, weights: bytes) -> Exported:
     """Return a network as ONNX: `states`, uint8 (batch, stack, size, size), to `q_values`, float32 (batch, actions).
 
-    Raises: Fault if the export fails, or its values in states of a game differ from torch's.
+    Raises: ConfigError for a network with a memory; Fault if the export fails, or its values in states of a game differ
+    from torch's.
     """
     network = build_trained_network(config, weights).eval()
+    if isinstance(network, Recurrent):
+        raise ConfigError(f"onnx=true: model={config.model.name} has a memory, which the format's one input leaves out")
     shape = config.env.state_shape
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)  # torch warns that torchvision is missing

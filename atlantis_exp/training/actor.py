@@ -2,13 +2,16 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 Generators = Sequence[np.random.Generator]
 States = npt.NDArray[np.uint8]  # (B, stack, size, size)
+Values = npt.NDArray[np.float32]  # (B, actions)
+Memory = npt.NDArray[np.float32]  # (B, units)
+NONE: Memory = np.empty((0, 0), np.float32)
 
 
 class Decisions(NamedTuple):
@@ -16,13 +19,19 @@ class Decisions(NamedTuple):
 
     actions: npt.NDArray[np.int64]  # (B,)
     random: npt.NDArray[np.bool_]  # (B,)
-    values: npt.NDArray[np.float32] | None = None  # (B, actions)
+    values: Values | None = None
 
 
 class Actor(Protocol):
-    """Choose an action for each of B states; state b draws only from the b-th generator."""
+    """Choose an action for each of B states; state b draws only from the b-th generator.
 
-    def act(self, states: States, epsilon: float, generators: Generators) -> Decisions: ...
+    A player of `units` remembers earlier states of an episode: it reads `memory` and writes it.
+    """
+
+    @property
+    def units(self) -> int: ...
+
+    def act(self, states: States, epsilon: float, generators: Generators, memory: Memory) -> Decisions: ...
 
 
 @dataclass(frozen=True)
@@ -32,11 +41,12 @@ class EpsilonGreedy:
     Random decisions skip the network, unless `watches`: then the decisions hold its values of all states.
     """
 
-    q_values: Callable[[States], npt.NDArray[np.float32]]
+    units: ClassVar[int] = 0
+    q_values: Callable[[States], Values]
     num_actions: int
     watches: bool = False
 
-    def act(self, states: States, epsilon: float, generators: Generators) -> Decisions:
+    def act(self, states: States, epsilon: float, generators: Generators, memory: Memory = NONE) -> Decisions:  # noqa: ARG002
         random = np.array([generator.random() < epsilon for generator in generators])
         actions = np.empty(len(states), np.int64)
         for row in np.flatnonzero(random).tolist():
@@ -51,12 +61,29 @@ class EpsilonGreedy:
 
 
 @dataclass(frozen=True)
+class RecurrentGreedy:
+    """Choose as `EpsilonGreedy` by a network with a memory, which sees every state, random decisions or not.
+
+    step: returns the values of states and the memory after them.
+    """
+
+    units: int
+    step: Callable[[States, Memory], tuple[Values, Memory]]
+    num_actions: int
+
+    def act(self, states: States, epsilon: float, generators: Generators, memory: Memory) -> Decisions:
+        values, memory[:] = self.step(states, memory)
+        return EpsilonGreedy(lambda _: values, self.num_actions, watches=True).act(states, epsilon, generators)
+
+
+@dataclass(frozen=True)
 class RandomActor:
     """Choose any action, whatever epsilon is (report figure 1.4)."""
 
+    units: ClassVar[int] = 0
     num_actions: int
 
-    def act(self, states: States, epsilon: float, generators: Generators) -> Decisions:  # noqa: ARG002
+    def act(self, states: States, epsilon: float, generators: Generators, memory: Memory = NONE) -> Decisions:  # noqa: ARG002
         actions = np.array([generator.integers(self.num_actions) for generator in generators], np.int64)
         return Decisions(actions, np.ones(len(states), np.bool_))
 
@@ -65,10 +92,11 @@ class RandomActor:
 class PersonActor:
     """Let a person `choose` an action from the screen of a single emulator, (210, 160, 3) uint8."""
 
+    units: ClassVar[int] = 0
     screen: Callable[[], npt.NDArray[np.uint8]]
     choose: Callable[[npt.NDArray[np.uint8]], int]
 
-    def act(self, states: States, epsilon: float, generators: Generators) -> Decisions:  # noqa: ARG002
+    def act(self, states: States, epsilon: float, generators: Generators, memory: Memory = NONE) -> Decisions:  # noqa: ARG002
         return Decisions(np.array([self.choose(self.screen())], np.int64), np.zeros(1, np.bool_))
 
 
@@ -76,7 +104,8 @@ class PersonActor:
 class ConstantActor:
     """Choose always the same action, whatever epsilon is."""
 
+    units: ClassVar[int] = 0
     action: int
 
-    def act(self, states: States, epsilon: float, generators: Generators) -> Decisions:  # noqa: ARG002
+    def act(self, states: States, epsilon: float, generators: Generators, memory: Memory = NONE) -> Decisions:  # noqa: ARG002
         return Decisions(np.full(len(states), self.action, np.int64), np.zeros(len(states), np.bool_))

@@ -198,7 +198,7 @@ def evaluate(
         for index in range(episodes)
     ]
     streams = [np.random.default_rng(_seed_sequence(seed, index).spawn(1)[0]) for index in range(episodes)]
-    stacks = FrameStack(emulators.num_envs, size, lags)
+    stacks = FrameStack(emulators.num_envs, size, lags, actor.units)
     waiting = iter(range(episodes))
     playing: dict[int, int] = {}  # environment to the episode it plays
     under_way: deque[tuple[range, npt.NDArray[np.int64], Decisions]] = deque()  # each with the half that it is of
@@ -214,7 +214,9 @@ def evaluate(
     def decide(half: range) -> None:
         envs = np.array([env for env in half if env in playing])
         if len(envs):
-            decisions = actor.act(stacks.state[envs], epsilon, [streams[playing[env]] for env in envs])
+            memory = stacks.memory[envs]
+            decisions = actor.act(stacks.state[envs], epsilon, [streams[playing[env]] for env in envs], memory)
+            stacks.memory[envs] = memory
             emulators.send(decisions.actions, envs)
             under_way.append((half, envs, decisions))
 

@@ -93,7 +93,7 @@ def forecast(
 
     def update() -> None:
         ids, weights = sampler.sample(memory, plan.batch_size, rng)
-        learner.update(*memory.gather(ids, plan.returns), weights).cpu()  # waits for a GPU
+        learner.update(*plan.gather(memory, ids), weights=weights).cpu()  # waits for a GPU
 
     with learner.restored():
         play_seconds = _median_seconds(play, at_least=8, seconds=1.0)
@@ -106,7 +106,8 @@ def forecast(
     each = done.steps / plan.done(done) if plan.done(done) else usual
     length = done.steps + round((plan.length - plan.done(done)) * each)
     epsilon = statistics.fmean(plan.epsilon(progress, int(progress * length)) for progress in np.linspace(0, 1, 101))
-    acts = 1 - epsilon**num_envs  # share of the iterations in which any environment asks the network
+    # The share of the iterations in which any environment asks the network.
+    acts = 1.0 if plan.window else 1 - epsilon**num_envs
     seconds_a_step = (play_seconds + acts * act_seconds) / num_envs + update_seconds / plan.learn_every
     steps = max(1, (length if trainer.last_step is None else min(length, trainer.last_step)) - done.steps)
     an_observation = memory.nbytes / (memory.next_id - memory.oldest_id)  # bytes

@@ -4,10 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from atlantis_exp.learning.schedules import Schedule
-from atlantis_exp.replay.memory import Returns
+from atlantis_exp.replay.memory import ReplayMemory, Returns, Sequences, Transitions, Window
 from atlantis_exp.replay.samplers import Sampler
 from atlantis_exp.runs.files import checked
 
@@ -57,12 +59,19 @@ class Plan:
     terminal_on_life_loss: bool  # for the learner; the episode continues
     learn_every: int  # steps
     learn_start: int  # transitions in the memory
-    batch_size: int  # transitions
+    batch_size: int  # transitions, or sequences
+    window: Window | None = None  # of the sequences that a network with a memory learns from
 
     @property
     def length(self) -> int:
         """The length of all phases, in the plan's unit."""
         return sum(phase.length for phase in self.phases)
+
+    def gather(self, memory: ReplayMemory, ids: npt.NDArray[np.int64]) -> Transitions | Sequences:
+        """Return what an update learns from. Raises: ValueError if an id is not available."""
+        if self.window is None:
+            return memory.gather(ids, self.returns)
+        return memory.gather_sequences(ids, self.returns, self.window)
 
     def done(self, counters: Counters) -> int:
         """Return how much of `length` is done."""

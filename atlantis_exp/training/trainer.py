@@ -67,12 +67,12 @@ class Trainer:
             sampler = self.plan.phase_at(self.counters).sampler
             self.learner.learning_rate = self.plan.learning_rate_at(self.counters)
             epsilon = self.plan.epsilon_at(self.counters)
-            decisions = self.actor.act(self.stack.state, epsilon, self.exploration)
+            decisions = self.actor.act(self.stack.state, epsilon, self.exploration, self.stack.memory)
             self.emulators.send(decisions.actions)
             if not overlap:
                 steps = self._observe(decisions)
             for ids, weights in self._due_batches(sampler):
-                errors = self.learner.update(*self.memory.gather(ids, self.plan.returns), weights)
+                errors = self.learner.update(*self.plan.gather(self.memory, ids), weights=weights)
                 if weights is not None:
                     self._errors.append((sampler, ids, errors))
             if overlap:

@@ -48,7 +48,7 @@ def test_a_preset_and_a_chosen_option_show_their_keys() -> None:
     assert "epsilon.duration" not in shown_keys("train")
     assert "epsilon.decay" not in shown_keys("train")
     assert "epsilon.decay" in shown_keys("train", "all")
-    assert "model=nothing   (cnn, cnn_small, resnet, resnet_fast)" in help_text("train", ["model=nothing"])
+    assert "model=nothing   (cnn, cnn_gru, cnn_small, resnet, resnet_fast)" in help_text("train", ["model=nothing"])
 
 
 def test_every_sentence_next_to_a_key_is_there() -> None:

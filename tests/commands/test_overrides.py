@@ -69,7 +69,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("experiment=quik", "experiment=quik", "'quick'"),
     ("phase={}", "phase={}", "quick, single, steps, two_phase"),
     ("env=3", "env=3", "atlantis_v0"),
-    ("model=null", "model=None", "cnn, cnn_small, resnet, resnet_fast"),
+    ("model=null", "model=None", "cnn, cnn_gru, cnn_small, resnet, resnet_fast"),
     ("objective.name=double", "objective.name=double", "'double_dqn'"),
     ("env.id=Pong-v0", "env.id=Pong-v0", "ALE/Atlantis-v5, Atlantis-v0"),
     ("resume=maybe", "resume=maybe", "auto, must, never"),
@@ -234,7 +234,7 @@ def test_a_plugin_of_an_unknown_user_is_one_line_before_hydra_reads_it() -> None
         ("optimizer.lr=interval(0,1)", "optimizer.lr=interval(0,1): not a list of values; write them out"),
         (
             "model=glob(*)",
-            "model=glob(*): list the options, as in model=cnn,cnn_small,resnet,resnet_fast",
+            "model=glob(*): list the options, as in model=cnn,cnn_gru,cnn_small,resnet,resnet_fast",
         ),
         ("model=glob(resnet*)", "model=glob(resnet*): list the options, as in model=resnet,resnet_fast"),
         ("seed=glob(*)", "seed=glob(*): not a list of values; write them out"),

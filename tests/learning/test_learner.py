@@ -701,14 +701,14 @@ def test_acting_follows_every_update_though_the_target_stays() -> None:
 def test_weights_count_in_the_loss_and_a_sample_of_weight_0_teaches_nothing() -> None:
     weighted, twin = _learner(DQNCnn), _learner(DQNCnn)
     batch = _batch(36)
-    weighted.update(*batch, np.array([0.5] * 6))
+    weighted.update(*batch, weights=np.array([0.5] * 6))
     twin.objective = _Halved()
     twin.update(*batch)
     torch.testing.assert_close(weighted.network.state_dict(), twin.network.state_dict())
     still = _learner(DQNCnn)
     before = copy.deepcopy(still.network.state_dict())
     still.optimizer = torch.optim.SGD(still.network.parameters(), lr=1.0)
-    still.update(*batch, np.zeros(6))
+    still.update(*batch, weights=np.zeros(6))
     torch.testing.assert_close(still.network.state_dict(), before)
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 
-from atlantis_exp.replay.memory import ReplayMemory, Returns, Transitions
+from atlantis_exp.replay.memory import ReplayMemory, Returns, Transitions, Window
 
 SHAPE = (6, 5)
 ONE_STEP = Returns(0.9)
@@ -184,6 +184,43 @@ def test_the_memory_is_the_newest_part_of_a_list_of_whole_transitions(
             assert set(memory.draw(50, np.random.default_rng(0)).tolist()) <= set(ids)
             since = memory.next_id - 5
             assert sorted(memory.completed(since)) == [k for k in ids if oracle.successors[k] >= since]
+
+
+@given(
+    capacity=CAPACITIES,
+    noise_frames=NOISE_BUDGETS,
+    lags=LAGS,
+    events=EVENTS,
+    n_step=st.integers(1, 6),
+    burn_in=st.integers(0, 8),
+    unroll=st.integers(1, 8),
+)
+def test_a_sequence_is_its_transitions_from_the_oldest_stored_of_the_episode(
+    capacity: int, noise_frames: int, lags: Sequence[int], events: list[Event], n_step: int, burn_in: int, unroll: int
+) -> None:
+    memory, oracle = memory_of(max(capacity, lags[-1] + 2), noise_frames, lags), Oracle(lags)
+    for event in events:
+        oracle.feed(memory, event)
+    ids, returns = oracle.available(memory.oldest_id), Returns(0.9, n_step)
+    if not ids:
+        return
+    before = {oracle.successors[k]: k for k in ids}
+    batch = memory.gather_sequences(np.array(ids), returns, Window(burn_in, unroll, n_step))
+    assert batch.states.shape == (len(ids), burn_in + unroll + n_step, len(lags), *SHAPE)
+    for row, k in enumerate(ids):
+        chain = [k]
+        while len(chain) < burn_in + unroll and chain[0] in before:
+            chain.insert(0, before[chain[0]])
+        first = burn_in + unroll - len(chain)
+        assert batch.first[row] == first
+        for place in range(burn_in + unroll):
+            s_t, a_t, r_t, s_tpm, discount = oracle.transition(chain[max(place - first, 0)], returns)
+            np.testing.assert_array_equal(batch.states[row, place], s_t)
+            if place >= burn_in:
+                step = row, place - burn_in
+                assert (batch.a_t[step], batch.discount[step]) == (a_t, np.float32(discount))
+                assert batch.r_t[step] == np.float32(r_t)
+                np.testing.assert_array_equal(batch.states[row, max(place, first) + batch.m[step]], s_tpm)
 
 
 @pytest.mark.parametrize("returns", [ONE_STEP, Returns(0.9, n_step=3)])

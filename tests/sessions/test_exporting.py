@@ -20,7 +20,7 @@ from atlantis_exp.comparison.gather import gather
 from atlantis_exp.comparison.tables import compare
 from atlantis_exp.comparison.verdict import Question
 from atlantis_exp.config import Config
-from atlantis_exp.faults import Fault
+from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.sessions import cards, exporting, onnx
 from atlantis_exp.sessions.cards import build_exported_actor, read_card
@@ -270,6 +270,13 @@ def test_a_network_as_onnx_says_what_it_says_in_torch(
     actor = build_exported_actor(card.config, weights, "cpu")
     assert isinstance(actor, EpsilonGreedy)
     np.testing.assert_allclose(values, actor.q_values(states), rtol=1e-4, atol=1e-5)
+
+
+def test_a_network_with_a_memory_is_not_written_as_onnx(tiny: Compose) -> None:
+    config = tiny("model=cnn_gru")
+    weights = safetensors.torch.save(build_network(config, "network").state_dict())
+    with pytest.raises(ConfigError, match="onnx=true: model=cnn_gru has a memory"):
+        onnx.export_onnx(config, weights)
 
 
 def test_onnx_without_its_extra_is_one_line(

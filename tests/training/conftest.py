@@ -20,11 +20,12 @@ from atlantis_exp.game.preprocessing import FrameStack
 from atlantis_exp.game.vector import Emulators, make_emulators
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.learning.objectives import DQN
+from atlantis_exp.learning.recurrent import RecurrentLearner
 from atlantis_exp.learning.schedules import Constant, Exponential
-from atlantis_exp.replay.memory import ReplayMemory, Returns
+from atlantis_exp.replay.memory import ReplayMemory, Returns, Window
 from atlantis_exp.replay.samplers import UniformSampler
 from atlantis_exp.runs.journal import Journal
-from atlantis_exp.training.actor import EpsilonGreedy
+from atlantis_exp.training.actor import Actor, EpsilonGreedy, RecurrentGreedy
 from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.evaluator import Evaluator
 from atlantis_exp.training.plan import Cadence, Phase, Plan
@@ -78,15 +79,37 @@ def emulators_of(num_envs: int, steps: int = 40, game: type[Game] = Game) -> Emu
     return make_emulators(cast(Callable[[], Emulator], partial(game, steps)), num_envs, 0)
 
 
-def learner_of(seed: int = 0, lags: Sequence[int] = LAGS, **options: Any) -> Learner:
+def learner_of(seed: int = 0, lags: Sequence[int] = LAGS, remembers: bool = False, **options: Any) -> Learner:
     def network() -> nn.Module:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
+            if remembers:
+                return Remembering(lags)
             return nn.Sequential(nn.Flatten(), nn.Linear(len(lags) * SIZE * SIZE, NUM_ACTIONS))
 
     online = network()
     optimizer = torch.optim.AdamW(online.parameters(), 1e-3)
+    if remembers:
+        return RecurrentLearner(online, network(), optimizer, DQN(), 1e-4, ahead=1, **options)
     return Learner(online, network(), optimizer, DQN(), 1e-4, **options)
+
+
+class Remembering(nn.Module):
+    """A network of one recurrent layer."""
+
+    units, burn_in, unroll = 12, 2, 24
+
+    def __init__(self, lags: Sequence[int]) -> None:
+        super().__init__()
+        self.core = nn.GRUCell(len(lags) * SIZE * SIZE, self.units)
+        self.head = nn.Linear(self.units, NUM_ACTIONS)
+
+    def sequence(self, x: torch.Tensor, h: torch.Tensor, first: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        values = []
+        for t in range(x.shape[1]):
+            h = self.core(x[:, t].flatten(1), h * (t > first).unsqueeze(1))
+            values.append(self.head(h))
+        return torch.stack(values, 1) if values else x.new_zeros(len(x), 0, NUM_ACTIONS), h
 
 
 PLAN = Plan(
@@ -125,7 +148,7 @@ def small() -> Callable[..., Trainer]:
     """Builds a trainer in a folder and continues from the checkpoint there: `small(tmp_path, num_envs=3)`.
 
     Fields of `Plan` and `Cadence` may be given by their names; episode_steps is an episode's length, capacity the
-    replay memory's in observations, console what is told, game what is played.
+    replay memory's in observations, console what is told, game what is played, remembers whether by a memory.
     """
 
     def built(
@@ -140,13 +163,22 @@ def small() -> Callable[..., Trainer]:
         console: Console | None = None,
         game: type[Game] = Game,
         lags: Sequence[int] = LAGS,
+        remembers: bool = False,
         **options: Any,
     ) -> Trainer:
+        if remembers:
+            options["window"] = Window(Remembering.burn_in, Remembering.unroll, 1)
         plan = Plan(**{**vars(PLAN), **_taken(options, Plan)})
         cadence = Cadence(**{**vars(CADENCE), **_taken(options, Cadence)})
         assert not options, options
         exploration, sampling, emulation = np.random.SeedSequence(seed).spawn(3)
-        learner = learner_of(seed, lags)
+        learner = learner_of(seed, lags, remembers)
+        actor: Actor = EpsilonGreedy(learner.q_values, NUM_ACTIONS)
+        watched: Actor = EpsilonGreedy(learner.evaluated_q_values, NUM_ACTIONS, watches=True)
+        if isinstance(learner, RecurrentLearner):
+            actor, watched = (
+                RecurrentGreedy(Remembering.units, step, NUM_ACTIONS) for step in (learner.step, learner.evaluated_step)
+            )
         memory = ReplayMemory(capacity, (SIZE, SIZE), lags=lags, budget_bytes=BUDGET)
         evaluator = Evaluator(
             most_frames=1_000,
@@ -162,8 +194,8 @@ def small() -> Callable[..., Trainer]:
         trainer = Trainer(
             plan=plan,
             emulators=emulators_of(num_envs, episode_steps, game),
-            stack=FrameStack(num_envs, SIZE, lags),
-            actor=EpsilonGreedy(learner.q_values, NUM_ACTIONS),
+            stack=FrameStack(num_envs, SIZE, lags, actor.units),
+            actor=actor,
             memory=memory,
             learner=learner,
             exploration=[np.random.default_rng(child) for child in exploration.spawn(num_envs)],
@@ -176,7 +208,7 @@ def small() -> Callable[..., Trainer]:
                 memory=memory,
                 tracker=Journal(folder),
                 progress=Progress(console or Console(quiet=True)),
-                play=partial(evaluator, EpsilonGreedy(learner.evaluated_q_values, NUM_ACTIONS, watches=True)),
+                play=partial(evaluator, watched),
                 film=evaluator.film,
                 score_range=ATLANTIS.score_range,
             ),

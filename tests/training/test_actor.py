@@ -5,7 +5,15 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from atlantis_exp.training.actor import ConstantActor, EpsilonGreedy, RandomActor
+from atlantis_exp.training.actor import (
+    ConstantActor,
+    EpsilonGreedy,
+    Memory,
+    RandomActor,
+    RecurrentGreedy,
+    States,
+    Values,
+)
 
 STATES = np.zeros((5, 4, 8, 8), np.uint8)
 
@@ -93,3 +101,16 @@ def _same(streams: list[np.random.Generator]) -> Iterator[list[np.random.Generat
         if step == 50:
             return
         yield streams
+
+
+def test_a_player_with_a_memory_sees_every_state_and_decides_as_one_without() -> None:
+    def step(states: States, memory: Memory) -> tuple[Values, Memory]:
+        return values_of(states), memory + len(states)
+
+    memory = np.zeros((len(STATES), 2), np.float32)
+    decisions = RecurrentGreedy(2, step, 4).act(STATES, 0.5, generators(), memory)
+    expected = EpsilonGreedy(values_of, 4, watches=True).act(STATES, 0.5, generators())
+    for ours, theirs in zip(decisions, expected, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert decisions.random.any()
+    np.testing.assert_array_equal(memory, len(STATES))

@@ -11,7 +11,18 @@ from atlantis_exp.build import build_learner, make_emulator
 from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.config import Config
 from atlantis_exp.game.vector import Emulators, make_emulators
-from atlantis_exp.training.actor import Actor, Decisions, EpsilonGreedy, Generators, RandomActor, States
+from atlantis_exp.training.actor import (
+    NONE,
+    Actor,
+    Decisions,
+    EpsilonGreedy,
+    Generators,
+    Memory,
+    RandomActor,
+    RecurrentGreedy,
+    States,
+    Values,
+)
 from atlantis_exp.training.evaluation import Episode, Evaluation, evaluate
 
 Compose = Callable[..., Config]
@@ -38,6 +49,15 @@ def test_an_episode_depends_on_the_seed_and_its_index_alone(played: Callable[...
     actions = {bytes(episode.actions) for episode in alone.episodes}
     assert len(actions) == 4
     assert all(episode.steps == 25 and episode.truncated for episode in alone.episodes)
+
+
+def test_an_episode_begins_without_a_memory_and_keeps_its_own(played: Callable[..., Evaluation]) -> None:
+    def step(_: States, memory: Memory) -> tuple[Values, Memory]:
+        return np.eye(4, dtype=np.float32)[memory[:, 0].astype(int) % 4], memory + 1
+
+    for num_envs in (1, 3, 4):
+        evaluation = played(num_envs, RecurrentGreedy(1, step, 4), epsilon=0.0)
+        assert [[*episode.actions] for episode in evaluation.episodes] == [[each % 4 for each in range(25)]] * 4
 
 
 @pytest.mark.slow
@@ -73,9 +93,9 @@ def test_the_actor_decides_for_one_half_while_the_other_is_emulated(
     tape: list[str] = []
 
     class Watched(RandomActor):
-        def act(self, states: States, epsilon: float, generators: Generators) -> Decisions:
+        def act(self, states: States, epsilon: float, generators: Generators, memory: Memory = NONE) -> Decisions:
             tape.append(f"decide {len(states)}")
-            return super().act(states, epsilon, generators)
+            return super().act(states, epsilon, generators, memory)
 
     def watch(emulators: Emulators, name: str) -> None:
         called = getattr(emulators, name)

@@ -1,24 +1,28 @@
-"""States with gaps, and a task that is not solved without them: a light shows 20 steps before which action pays."""
+"""States with gaps and networks with a memory, and a task that is not solved without one of them.
+
+A light shows which action pays 20 steps later.
+"""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+import torch
 from rich.console import Console
 
 from atlantis_exp.game.emulator import Step
 from atlantis_exp.learning.schedules import Constant
-from atlantis_exp.replay.memory import Returns
+from atlantis_exp.replay.memory import Returns, Window
 from atlantis_exp.replay.samplers import UniformSampler
 from atlantis_exp.training.actor import Decisions
 from atlantis_exp.training.plan import Phase
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Trainer
-from tests.training.conftest import SIZE, Game
+from tests.training.conftest import SIZE, Game, Remembering
 
 LIT, CHOICE = 2, 22  # steps of an episode
 
@@ -48,17 +52,20 @@ class Cue(Game):
         return {**super().state_dict(), "pays": self.pays}
 
 
-@pytest.mark.parametrize(("lags", "is_solved"), [((0, 1, 2, 20), True), (range(4), False)])
-def test_a_state_that_reaches_back_to_the_light_solves_what_one_of_as_many_observations_cannot(
-    small: Callable[..., Trainer], tmp_path: Path, lags: Sequence[int], is_solved: bool
+@pytest.mark.parametrize(
+    ("lags", "remembers", "is_solved"), [((0, 1, 2, 20), False, True), (range(4), False, False), ((0,), True, True)]
+)
+def test_a_state_that_reaches_back_to_the_light_or_a_memory_solves_what_four_observations_cannot(
+    small: Callable[..., Trainer], tmp_path: Path, lags: Sequence[int], remembers: bool, is_solved: bool
 ) -> None:
     trainer = small(
         tmp_path,
         num_envs=4,
         game=Cue,
         lags=lags,
+        remembers=remembers,
         capacity=4_000,
-        phases=[Phase("quick", 4_000, 1e-3, UniformSampler())],
+        phases=[Phase("quick", 4_000, 1e-2 if remembers else 1e-3, UniformSampler())],
         epsilon=Constant(1.0),
         returns=Returns(0.0),
         batch_size=32,
@@ -86,3 +93,23 @@ def test_a_state_is_the_same_where_it_is_acted_on_and_where_it_is_learned_from(
     learned = trainer.memory.gather(ids[trainer.memory.available(ids)], Returns(0.9, n_step=5))
     np.testing.assert_array_equal(learned.s_t, np.concatenate(acted))
     assert len(learned.s_t) == 160  # in episodes of 40 steps
+
+
+def test_a_memory_acts_in_training_as_the_network_does_over_the_whole_episode(
+    small: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    trainer = small(tmp_path, num_envs=2, remembers=True, learn_start=10_000, epsilon=Constant(0.5), capacity=1_000)
+    acted, act = [], trainer.actor.act
+
+    def watched(*asked: Any) -> Decisions:
+        acted.append(act(*asked))
+        return acted[-1]
+
+    trainer.actor = SimpleNamespace(act=watched, units=Remembering.units)
+    trainer.run()
+    last_states = trainer.memory.next_id - np.array([6, 5])  # then come the last observations and new episodes
+    whole = trainer.memory.gather_sequences(last_states, Returns(0.9), Window(0, 40, 0))
+    x, nothing = torch.from_numpy(whole.states) / 255, torch.zeros(2, Remembering.units)
+    q, _ = cast(Remembering, trainer.learner.network).sequence(x, nothing, torch.from_numpy(whole.first))
+    played = np.stack([each.values for each in acted[-40:] if each.values is not None], 1)
+    np.testing.assert_allclose(q.detach(), played, atol=1e-5)

@@ -126,6 +126,10 @@ def test_the_same_seed_gives_the_same_training_and_another_seed_another(small: S
     "overrides",
     [
         ("model=cnn", "env.num_envs=1"),
+        (
+            *("model=cnn_gru", "model.units=16", "model.burn_in=3", "model.unroll=4", "env.num_envs=3"),
+            *("sampler=prioritized", "phase.quick.sampler=prioritized", "phase.second.sampler=prioritized"),
+        ),
         pytest.param(
             (
                 *("model=resnet", "env.size=16", "env.num_envs=3", "env.workers=2", "optimizer=rmsprop"),
@@ -246,11 +250,11 @@ def test_updates_are_those_that_a_naive_loop_counts(
     )
     tape = []
 
-    def update(*_: object) -> torch.Tensor:
+    def update(*_: object, **__: object) -> torch.Tensor:
         tape.append(len(trainer.memory))
         return torch.zeros(1)
 
-    trainer.learner.update = update  # type: ignore[method-assign, assignment]
+    trainer.learner.update = update  # type: ignore[method-assign]
     trainer.run()
 
     naive = []

@@ -1,0 +1,76 @@
+"""Update networks with a memory, from sequences."""
+
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import nn
+
+from atlantis_exp.learning.learner import Learner, Passed
+from atlantis_exp.learning.objectives import QFunction, td_errors
+from atlantis_exp.learning.values import Recurrent
+
+_MOST = 0.9  # of a sequence's largest error in its priority; the rest is the mean's (Kapturowski et al. 2019)
+
+
+class RecurrentLearner(Learner):
+    """Learn as `Learner`, from sequences of transitions (R2D2, Kapturowski et al. 2019).
+
+    The network's memory is recomputed with the latest weights, from zero over a burn-in without gradients; R2D2 also
+    tries stored memories, which the replay memory does not hold. A sequence's loss is the sum over its transitions,
+    divided by `unroll`; the first transition of an episode counts once, however many places it fills.
+
+    ahead: steps of a sequence after the last one to learn. Other arguments as for `Learner`.
+    """
+
+    def __init__(self, network: nn.Module, *arguments: Any, ahead: int, **options: Any) -> None:
+        super().__init__(network, *arguments, **options)
+        self.core = cast(Recurrent, network)
+        self._ahead = ahead
+
+    def evaluated_step(
+        self, states: npt.NDArray[np.uint8], memory: npt.NDArray[np.float32]
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        """Return the values (B, A) of the network to evaluate, and its memory (B, units) after the states."""
+        return self.all_steps(self._evaluated, states, memory)
+
+    def _passes(self, online: nn.Module, target_network: nn.Module, *batch: npt.NDArray[Any]) -> Passed:
+        """Pass a shard of `Sequences` through both networks."""
+        states, first, a_t, r_t, m, discount = batch
+        size, unroll, burn_in = len(states), self.core.unroll, self.core.burn_in
+        x = self._input(states.reshape(-1, *states.shape[2:])).reshape(states.shape)
+        nothing, first_B = torch.zeros(size, self.core.units, device=self.device), self._sent(first)
+        rows_B1 = torch.arange(size, device=self.device).unsqueeze(1)
+        step_BL = torch.arange(burn_in, burn_in + unroll, device=self.device).expand(size, unroll)
+        is_learned = step_BL >= first_B.unsqueeze(1)
+        step_BL = torch.maximum(step_BL, first_B.unsqueeze(1))
+        actions = self._sent(a_t).flatten()
+
+        def values_at(network: nn.Module) -> QFunction:
+            return lambda at_BL: cast(Recurrent, network).sequence(x, nothing, first_B)[0][rows_B1, at_BL].flatten(0, 1)
+
+        with torch.no_grad():
+            target = self.objective.targets(
+                self._floats(r_t).flatten(),
+                step_BL + self._sent(m),
+                self._floats(discount).flatten(),
+                lambda at: values_at(online)(at).float(),
+                lambda at: values_at(target_network)(at).float(),
+            )
+            _, h = cast(Recurrent, online).sequence(x[:, :burn_in], nothing, first_B)
+        online.train()
+        q_BL, _ = cast(Recurrent, online).sequence(x[:, burn_in : burn_in + unroll], h, first_B - burn_in)
+        online.eval()
+        q = q_BL.float()[rows_B1, step_BL - burn_in].flatten(0, 1)
+        losses = (self.objective.losses(q, actions, target).view(size, unroll) * is_learned).sum(1) / unroll
+        q = q.detach()
+        errors = td_errors(q, actions, target).view(size, unroll) * is_learned
+        priorities = _MOST * errors.amax(1) + (1 - _MOST) * errors.sum(1) / is_learned.sum(1)
+        return Passed(losses, priorities, q, target)
+
+    def _two_samples(self, state: tuple[int, int, int]) -> tuple[npt.NDArray[Any], ...]:
+        unroll, length = self.core.unroll, self.core.burn_in + self.core.unroll + self._ahead
+        zeros = np.zeros((2, unroll), np.float32)
+        whole = np.zeros((2, unroll), np.int64)
+        return np.zeros((2, length, *state), np.uint8), np.zeros(2, np.int64), whole, zeros, whole, zeros
