@@ -100,7 +100,7 @@ class FrameStack:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         if (state["state"].shape, state["state"].dtype) != (self._ring.shape, np.uint8):
             raise ValueError("the stacks do not have this game's shape")
-        memory = state.get("memory", self.memory)
+        memory = state["memory"] if self.memory.size else self.memory
         if (memory.shape, memory.dtype) != (self.memory.shape, np.float32) or not np.isfinite(memory).all():
             raise ValueError("the player's memory is not of its size, or not finite")
         self._ring, self._newest[:] = state["state"].copy(), self._ring.shape[1] - 1
