@@ -19,7 +19,7 @@ class RecurrentLearner(Learner):
 
     The network's memory is recomputed with the latest weights, from zero over a burn-in without gradients; R2D2 also
     tries stored memories, which the replay memory does not hold. A sequence's loss is the sum over its transitions,
-    divided by `unroll`; the first transition of an episode counts once, however many places it fills.
+    divided by `unroll`; a transition counts once, however many places it fills.
 
     ahead: steps of a sequence after the last one to learn. Other arguments as for `Learner`.
     """
@@ -37,14 +37,15 @@ class RecurrentLearner(Learner):
 
     def _passes(self, online: nn.Module, target_network: nn.Module, *batch: npt.NDArray[Any]) -> Passed:
         """Pass a shard of `Sequences` through both networks."""
-        states, first, a_t, r_t, m, discount = batch
+        states, first, last, a_t, r_t, m, discount = batch
         size, unroll, burn_in = len(states), self.core.unroll, self.core.burn_in
         x = self._input(states.reshape(-1, *states.shape[2:])).reshape(states.shape)
-        nothing, first_B = torch.zeros(size, self.core.units, device=self.device), self._sent(first)
+        nothing = torch.zeros(size, self.core.units, device=self.device)
+        first_B, last_B = self._sent(first), self._sent(last)
         rows_B1 = torch.arange(size, device=self.device).unsqueeze(1)
-        step_BL = torch.arange(burn_in, burn_in + unroll, device=self.device).expand(size, unroll)
-        is_learned = step_BL >= first_B.unsqueeze(1)
-        step_BL = torch.maximum(step_BL, first_B.unsqueeze(1))
+        step_1L = torch.arange(burn_in, burn_in + unroll, device=self.device).unsqueeze(0)
+        step_BL = step_1L.clamp(first_B.unsqueeze(1), last_B.unsqueeze(1))
+        is_learned = step_BL == step_1L
         actions = self._sent(a_t).flatten()
 
         def values_at(network: nn.Module) -> QFunction:
@@ -72,5 +73,5 @@ class RecurrentLearner(Learner):
     def _two_samples(self, state: tuple[int, int, int]) -> tuple[npt.NDArray[Any], ...]:
         unroll, length = self.core.unroll, self.core.burn_in + self.core.unroll + self._ahead
         zeros = np.zeros((2, unroll), np.float32)
-        whole = np.zeros((2, unroll), np.int64)
-        return np.zeros((2, length, *state), np.uint8), np.zeros(2, np.int64), whole, zeros, whole, zeros
+        ends, whole = np.zeros((2, 2), np.int64), np.zeros((2, unroll), np.int64)
+        return np.zeros((2, length, *state), np.uint8), *ends, whole, zeros, whole, zeros

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,11 +64,12 @@ class Window(NamedTuple):
 class Sequences(NamedTuple):
     """A batch of B sequences of T states, of which L follow a burn-in and are learned.
 
-    Where an episode, or what is stored of it, begins within the sequence, its first transition fills the places before.
+    Places before an episode's oldest stored transition or after its latest one are filled with that one.
     """
 
     states: npt.NDArray[np.uint8]  # (B, T, stack, H, W)
-    first: npt.NDArray[np.int64]  # (B,), index of the first state that fills no place
+    first: npt.NDArray[np.int64]  # (B,), index of the oldest transition
+    last: npt.NDArray[np.int64]  # (B,), index of the latest one to learn
     a_t: npt.NDArray[np.int64]  # (B, L)
     r_t: npt.NDArray[np.float32]  # (B, L), the discounted sum of m rewards
     m: npt.NDArray[np.int64]  # (B, L), steps to the state that is valued next
@@ -188,25 +188,30 @@ class ReplayMemory:
         return Transitions(s_t, a_t, r_t, s_tpm, discount)
 
     def gather_sequences(self, ids: npt.NDArray[np.int64], returns: Returns, window: Window) -> Sequences:
-        """Return the sequences whose last learned transitions have these ids.
+        """Return sequences with the transitions of these ids in the middle of their learned part.
 
-        Raises: ValueError if one is not available.
+        So the ends of episodes are learned half as often as the rest. Raises: ValueError if one is not available.
         """
-        chain = [ids]  # newest first
-        for _ in range(window.burn_in + window.unroll - 1):
+        middle, length = window.burn_in + window.unroll // 2, window.burn_in + window.unroll
+        chain, first = [ids], np.full(len(ids), middle)  # newest first
+        for _ in range(middle):
             previous = chain[-1] - self._back[chain[-1] % self.capacity]
-            chain.append(np.where(self.available(previous), previous, chain[-1]))
+            previous = np.where(self.available(previous), previous, chain[-1])
+            first -= previous < chain[-1]
+            chain.append(previous)
         chain.reverse()
-        first = sum(((a == b).astype(np.int64) for a, b in pairwise(chain)), np.zeros(len(ids), np.int64))
-        learned = np.stack(chain[window.burn_in :], axis=1)
+        while len(chain) < length + window.ahead:
+            chain.append(chain[-1] + self._forward[chain[-1] % self.capacity])
+        states = np.stack(chain)
+        last = middle - 1 + self.available(states[middle:length]).sum(axis=0)
+        places = np.minimum(np.arange(window.burn_in, length)[:, np.newaxis], last)
+        learned = np.take_along_axis(states, places, axis=0).T
         steps = self._steps(learned.ravel(), returns)
         a_t, r_t, m, discount, _ = (each.reshape(learned.shape) for each in steps)
-        for _ in range(window.ahead):
-            chain.append(chain[-1] + self._forward[chain[-1] % self.capacity])
-        observations = self._state(np.concatenate(chain)).reshape(len(self.lags), len(chain), len(ids))
-        needed, place = np.unique(observations.transpose(2, 1, 0), return_inverse=True)
-        states = self._frames.decode(needed)[place.reshape(len(ids), len(chain), len(self.lags))]
-        return Sequences(states, first, a_t, r_t, m, discount)
+        observations = self._state(states.ravel()).reshape(len(self.lags), *states.shape)
+        needed, places = np.unique(observations.transpose(2, 1, 0), return_inverse=True)
+        frames = self._frames.decode(needed)[places.reshape(*states.T.shape, len(self.lags))]
+        return Sequences(frames, first, last, a_t, r_t, m, discount)
 
     def _steps(self, ids: npt.NDArray[np.int64], returns: Returns) -> tuple[npt.NDArray[Any], ...]:
         """Return the action of each transition, its rewards' sum, their number, its discount and its last id."""

@@ -31,12 +31,13 @@ def _learner(objective: Objective = DoubleDQN(), head: Head = nn.Linear, **optio
     return RecurrentLearner(network, target, optimizer, objective, 0.5, ahead=AHEAD, **options)
 
 
-def _batch(first: tuple[int, ...] = (0, 1, 2, 4, 5)) -> Batch:
+def _batch(first: tuple[int, ...] = (0, 1, 2, 4, 5), last: tuple[int, ...] = (3, 5, 2, 5, 5)) -> Batch:
     rng, size = np.random.default_rng(0), len(first)
     m = rng.integers(1, AHEAD + 1, (size, UNROLL))
     return (
         rng.integers(0, 256, (size, BURN_IN + UNROLL + AHEAD, 2, SIDE, SIDE), np.uint8),
         np.array(first),
+        np.array(last),
         rng.integers(0, 3, (size, UNROLL)),
         rng.random((size, UNROLL), np.float32),
         m,
@@ -47,8 +48,8 @@ def _batch(first: tuple[int, ...] = (0, 1, 2, 4, 5)) -> Batch:
 def _naive(learner: RecurrentLearner, weights: npt.NDArray[Any], batch: Batch) -> tuple[list[float], nn.Module]:
     """Take sequence by sequence, step by step; return the priorities, and the network with its gradients."""
     online, priorities = cast(DQNCnnGru, copy.deepcopy(learner.network)), []
-    for states, first, a_t, r_t, m, discount, weight in zip(*batch, weights, strict=True):
-        inside = range(max(BURN_IN, first), BURN_IN + UNROLL)
+    for states, first, last, a_t, r_t, m, discount, weight in zip(*batch, weights, strict=True):
+        inside = range(max(BURN_IN, first), last + 1)
 
         def q_of(network: Any, learned: range, states: Any = states, first: int = first) -> list[torch.Tensor]:
             """Values of each state, none before the first, with gradients in the learned steps."""
@@ -63,7 +64,8 @@ def _naive(learner: RecurrentLearner, weights: npt.NDArray[Any], batch: Batch) -
             partial(lambda said, at: said[int(at)], q_of(network, range(0))) for network in (online, learner.target)
         ]
         q, errors, losses = q_of(online, inside), [], []
-        for at, step in zip(inside, range(inside[0] - BURN_IN, UNROLL), strict=True):
+        for at in inside:
+            step = at - BURN_IN
             reward, gamma = torch.tensor(r_t[step : step + 1]), torch.tensor(discount[step : step + 1])
             target = learner.objective.targets(reward, torch.tensor(at + m[step]), gamma, *there)
             losses.append(learner.objective.losses(q[at], torch.tensor(a_t[step : step + 1]), target))
@@ -89,12 +91,13 @@ def test_an_update_is_the_sum_over_sequences_stepped_one_after_the_other(
         torch.testing.assert_close(ours.grad, theirs.grad, rtol=1e-3, atol=1e-7)
 
 
-def test_what_fills_the_places_before_an_episode_changes_nothing() -> None:
-    one, other, batch = _learner(), _learner(), _batch((3,))
+def test_what_fills_the_places_around_an_episode_changes_nothing() -> None:
+    one, other, batch = _learner(), _learner(), _batch((3,), (4,))
+    batch[5][:] = 1  # steps to the next state
     errors = one.update(*batch)
-    for each in batch[2:]:
-        each[:, 0] = 1 - each[:, 0]  # of step 2, before the first
-    batch[0][:, :3] = 7
+    for each in (*batch[3:5], batch[6]):
+        each[:, [0, 3]] = 1 - each[:, [0, 3]]  # of steps 2 and 5
+    batch[0][:, [0, 1, 2, 6, 7, 8]] = 7
     torch.testing.assert_close(other.update(*batch), errors, rtol=0, atol=0)
     torch.testing.assert_close(other.network.state_dict(), one.network.state_dict(), rtol=0, atol=0)
 

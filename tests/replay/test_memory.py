@@ -208,19 +208,22 @@ def test_a_sequence_is_its_transitions_from_the_oldest_stored_of_the_episode(
     batch = memory.gather_sequences(np.array(ids), returns, Window(burn_in, unroll, n_step))
     assert batch.states.shape == (len(ids), burn_in + unroll + n_step, len(lags), *SHAPE)
     for row, k in enumerate(ids):
-        chain = [k]
-        while len(chain) < burn_in + unroll and chain[0] in before:
-            chain.insert(0, before[chain[0]])
-        first = burn_in + unroll - len(chain)
-        assert batch.first[row] == first
+        places = {burn_in + unroll // 2: k}
+        while (first := min(places)) > 0 and places[first] in before:
+            places[first - 1] = before[places[first]]
+        while (last := max(places)) + 1 < burn_in + unroll and oracle.successors[places[last]] in oracle.transitions:
+            places[last + 1] = oracle.successors[places[last]]
+        assert (batch.first[row], batch.last[row]) == (first, last)
         for place in range(burn_in + unroll):
-            s_t, a_t, r_t, s_tpm, discount = oracle.transition(chain[max(place - first, 0)], returns)
-            np.testing.assert_array_equal(batch.states[row, place], s_t)
+            at = min(max(place, first), last)
+            s_t, a_t, r_t, s_tpm, discount = oracle.transition(places[at], returns)
+            if place <= last:
+                np.testing.assert_array_equal(batch.states[row, place], s_t)
             if place >= burn_in:
                 step = row, place - burn_in
                 assert (batch.a_t[step], batch.discount[step]) == (a_t, np.float32(discount))
                 assert batch.r_t[step] == np.float32(r_t)
-                np.testing.assert_array_equal(batch.states[row, max(place, first) + batch.m[step]], s_tpm)
+                np.testing.assert_array_equal(batch.states[row, at + batch.m[step]], s_tpm)
 
 
 @pytest.mark.parametrize("returns", [ONE_STEP, Returns(0.9, n_step=3)])

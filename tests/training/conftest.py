@@ -97,7 +97,7 @@ def learner_of(seed: int = 0, lags: Sequence[int] = LAGS, remembers: bool = Fals
 class Remembering(nn.Module):
     """A network of one recurrent layer."""
 
-    units, burn_in, unroll = 12, 2, 24
+    units, burn_in, unroll = 12, 2, 16
 
     def __init__(self, lags: Sequence[int]) -> None:
         super().__init__()

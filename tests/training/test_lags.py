@@ -1,6 +1,6 @@
 """States with gaps and networks with a memory, and a task that is not solved without one of them.
 
-A light shows which action pays 20 steps later.
+A light shows which action pays many steps later.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,11 +24,13 @@ from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Trainer
 from tests.training.conftest import SIZE, Game, Remembering
 
-LIT, CHOICE = 2, 22  # steps of an episode
+LIT = 2  # step of an episode
 
 
 class Cue(Game):
     """Dark but for a light on the left or the right, and a line at the top where the choice is due."""
+
+    due = 22  # step
 
     def reset(self, seed: int | None = None) -> npt.NDArray[np.uint8]:
         if seed is not None:
@@ -37,7 +39,7 @@ class Cue(Game):
         return self.screen()
 
     def step(self, action: int) -> Step:
-        over = self.played == CHOICE
+        over = self.played == self.due
         reward = float(over and action == self.pays)
         self.played += 1
         return Step(self.screen(), reward, over, False, False, 4, [reward, 0.0, 0.0, 0.0, 0.0])
@@ -45,27 +47,38 @@ class Cue(Game):
     def screen(self) -> npt.NDArray[np.uint8]:
         screen = np.zeros((2, SIZE, SIZE // 2), np.uint8)
         screen[self.pays] = 255 * (self.played == LIT)
-        screen[:, 0] = np.maximum(screen[:, 0], 255 * (self.played == CHOICE))
+        screen[:, 0] = np.maximum(screen[:, 0], 255 * (self.played == self.due))
         return np.hstack([*screen])
 
     def state_dict(self) -> dict[str, Any]:
         return {**super().state_dict(), "pays": self.pays}
 
 
+class SoonDue(Cue):
+    due = 8
+
+
 @pytest.mark.parametrize(
-    ("lags", "remembers", "is_solved"), [((0, 1, 2, 20), False, True), (range(4), False, False), ((0,), True, True)]
+    ("game", "lags", "remembers", "is_solved"),
+    [(Cue, (0, 1, 2, 20), False, True), (SoonDue, range(4), False, False), (SoonDue, (0,), True, True)],
 )
 def test_a_state_that_reaches_back_to_the_light_or_a_memory_solves_what_four_observations_cannot(
-    small: Callable[..., Trainer], tmp_path: Path, lags: Sequence[int], remembers: bool, is_solved: bool
+    small: Callable[..., Trainer],
+    tmp_path: Path,
+    game: type[Game],
+    lags: Sequence[int],
+    remembers: bool,
+    is_solved: bool,
 ) -> None:
+    steps, rate = (1_600, 1e-2) if remembers else (4_000, 1e-3)
     trainer = small(
         tmp_path,
         num_envs=4,
-        game=Cue,
+        game=game,
         lags=lags,
         remembers=remembers,
         capacity=4_000,
-        phases=[Phase("quick", 4_000, 1e-2 if remembers else 1e-3, UniformSampler())],
+        phases=[Phase("quick", steps, rate, UniformSampler())],
         epsilon=Constant(1.0),
         returns=Returns(0.0),
         batch_size=32,
@@ -108,7 +121,7 @@ def test_a_memory_acts_in_training_as_the_network_does_over_the_whole_episode(
     trainer.actor = SimpleNamespace(act=watched, units=Remembering.units)
     trainer.run()
     last_states = trainer.memory.next_id - np.array([6, 5])  # then come the last observations and new episodes
-    whole = trainer.memory.gather_sequences(last_states, Returns(0.9), Window(0, 40, 0))
+    whole = trainer.memory.gather_sequences(last_states, Returns(0.9), Window(39, 1, 0))
     x, nothing = torch.from_numpy(whole.states) / 255, torch.zeros(2, Remembering.units)
     q, _ = cast(Remembering, trainer.learner.network).sequence(x, nothing, torch.from_numpy(whole.first))
     played = np.stack([each.values for each in acted[-40:] if each.values is not None], 1)
