@@ -569,7 +569,7 @@ def test_a_signal_that_comes_when_a_run_has_nothing_left_to_stop_ends_its_sweep(
         ("model=resnet", "env.size=16", "env.num_envs=8", "env.workers=2", "phase.quick.steps=20_000"),
     ],
 )
-@pytest.mark.timeout(1_200)  # seconds
+@pytest.mark.timeout(2_400)  # seconds; twenty sessions import torch
 def test_a_training_killed_twenty_times_is_the_unbroken_one_and_mlflow_has_each_point_once(
     tiny: Compose, tiny_overrides: tuple[str, ...], tmp_path: Path, overrides: tuple[str, ...]
 ) -> None:
