@@ -45,7 +45,7 @@ Share = Annotated[float, Interval(gt=0, lt=1)]
 Oversample = Annotated[int, Interval(ge=2, le=64)]
 Quantiles = Annotated[int, Interval(ge=1, le=1_000)]  # an update holds N x N differences per sample
 Units = Annotated[int, Interval(ge=1, le=4_096)]
-Steps = Annotated[int, Interval(ge=1, le=256)]  # an update holds the frames of all
+Steps = Annotated[int, Interval(ge=1, le=256)]  # an update holds the frames of every step
 Rescaling = Literal["signed_sqrt", "symlog"]
 
 

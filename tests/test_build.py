@@ -4,18 +4,24 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import cast
 
 import pytest
+import safetensors.torch
 import torch
 
 from atlantis_exp import build
-from atlantis_exp.build import build_emulators, build_evaluator, build_learner, build_memory
+from atlantis_exp.build import build_emulators, build_evaluator, build_learner, build_memory, build_network_actor
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.game.vector import ProcessEmulators
+from atlantis_exp.learning.recurrent import RecurrentLearner
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.sessions.processor import set_up_torch
+from atlantis_exp.training.actor import RecurrentGreedy
+from atlantis_exp.training.trainer import Trainer
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -140,3 +146,20 @@ def test_an_evaluation_leaves_a_core_to_the_network(
 def test_a_network_with_a_memory_is_not_compiled(tiny: Callable[..., Config]) -> None:
     with pytest.raises(ConfigError, match="compile=true: model=cnn_gru has a memory"):
         build_learner(tiny("model=cnn_gru", "compile=true"))
+
+
+def test_a_network_with_a_memory_acts_is_watched_and_is_evaluated_with_it(
+    tiny: Callable[..., Config], started: Callable[[Config, Path], Trainer], tmp_path: Path
+) -> None:
+    config = tiny("model=cnn_gru", "model.units=6", "model.burn_in=3", "objective.n_step=2", "training.ema=50")
+    trainer = started(config, tmp_path)
+    actor, learner = trainer.actor, trainer.learner
+    (watched,) = cast("partial[object]", trainer.recorder.play).args
+    assert isinstance(actor, RecurrentGreedy)
+    assert isinstance(watched, RecurrentGreedy)
+    assert isinstance(learner, RecurrentLearner)
+    assert (actor.step, watched.step) == (learner.step, learner.evaluated_step)
+    assert (actor.units, watched.units, trainer.stack.memory.shape) == (6, 6, (1, 6))
+    assert trainer.plan.window == (3, 20, 2) == (3, 20, learner._ahead)
+    weights = safetensors.torch.save(learner.network.state_dict())
+    assert isinstance(build_network_actor(config, weights, "cpu"), RecurrentGreedy)

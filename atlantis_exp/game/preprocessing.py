@@ -68,41 +68,56 @@ class FrameStack:
     `state` is (num_envs, stack, size, size) uint8. Every change makes a new array, so earlier states never change:
     `stack_frame` of report figure 2.3 shifts in place, which makes every next state equal to its state.
 
-    `memory`, (num_envs, units) float32, is the player's own, who may write to it; an episode begins with zeros.
+    `memory`, (num_envs, units) float32, belongs to the player, who writes to it; it is zero when an episode begins.
     """
 
     def __init__(self, num_envs: int, size: int, lags: Sequence[int] = range(4), units: int = 0) -> None:
-        self._places = lags[-1] - np.array(lags)[::-1]  # of a state's observations among the last ones
+        self._lags = np.array(lags)[::-1]
+        self._ring: Pixels = np.zeros((num_envs, lags[-1] + 1, size, size), np.uint8)  # each environment's newest
+        self._newest = np.zeros(num_envs, np.intp)  # each environment's place in it
+        self._all = np.arange(num_envs)
+        self.state = self._ago(self._all, self._lags)
         self.memory = np.zeros((num_envs, units), np.float32)
-        self._keep(np.zeros((num_envs, lags[-1] + 1, size, size), np.uint8))
 
     def reset(self, envs: Envs, observations: Pixels) -> Pixels:
         """Begin an episode in `envs` with these observations, (len(envs), size, size); return the state of all."""
-        rows, last = np.asarray(envs, np.intp), self._last.copy()
-        last[rows] = observations[:, np.newaxis]
+        rows = np.asarray(envs, np.intp)
+        self._ring[rows] = observations[:, np.newaxis]
         self.memory[rows] = 0.0
-        return self._keep(last)
+        return self._renew(rows)
 
     def push(self, observations: Pixels, envs: Envs | None = None) -> Pixels:
         """Append these observations, (len(envs), size, size), in `envs`, by default all; return the state of all."""
-        rows = np.arange(len(self._last)) if envs is None else np.asarray(envs, np.intp)
-        last = self._last.copy()
-        last[rows, :-1], last[rows, -1] = self._last[rows, 1:], observations
-        return self._keep(last)
+        rows = self._all if envs is None else np.asarray(envs, np.intp)
+        newest = self._newest[rows] = (self._newest[rows] + 1) % self._ring.shape[1]
+        self._ring[rows, newest] = observations
+        return self._renew(rows)
 
     def state_dict(self) -> dict[str, Any]:
-        return {"state": self._last, **({"memory": self.memory.copy()} if self.memory.size else {})}
+        state = self._ago(self._all, np.arange(self._ring.shape[1])[::-1])
+        return {"state": state, **({"memory": self.memory.copy()} if self.memory.size else {})}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        if (state["state"].shape, state["state"].dtype) != (self._last.shape, np.uint8):
+        if (state["state"].shape, state["state"].dtype) != (self._ring.shape, np.uint8):
             raise ValueError("the stacks do not have this game's shape")
         memory = state["memory"] if self.memory.size else self.memory
         if (memory.shape, memory.dtype) != (self.memory.shape, np.float32) or not np.isfinite(memory).all():
             raise ValueError("the player's memory is not of its size, or not finite")
-        self._keep(state["state"].copy())
+        self._ring, self._newest[:] = state["state"].copy(), self._ring.shape[1] - 1
         self.memory[:] = memory
+        self._renew(self._all)
 
-    def _keep(self, last: Pixels) -> Pixels:
-        """Keep the last observations of each environment, (num_envs, reach, size, size); return the state of all."""
-        self._last, self.state = last, last[:, self._places]
+    def _renew(self, rows: npt.NDArray[np.intp]) -> Pixels:
+        """Make the states of some environments anew; return the state of all."""
+        states = self._ago(rows, self._lags)
+        if rows is self._all:
+            self.state = states
+        else:
+            self.state = self.state.copy()
+            self.state[rows] = states
         return self.state
+
+    def _ago(self, rows: npt.NDArray[np.intp], lags: npt.NDArray[np.int_]) -> Pixels:
+        """Return the observations of some environments so many steps ago, (len(rows), len(lags), size, size)."""
+        rows = rows[:, np.newaxis]
+        return cast(Pixels, self._ring[rows, (self._newest[rows] - lags) % self._ring.shape[1]])

@@ -17,6 +17,8 @@ in the learner's choice of mode."""
 class Objective(Protocol):
     """Compute targets without gradient, then a loss per sample, which the learner averages over the batch.
 
+    With a network that has a memory, s_tpm is one number a sample, which only `online` and `target` can read.
+
     A sample's reward and discount (B,) cover the m steps from s_t to s_tpm. Discount 0 cuts the bootstrap, as after a
     terminated episode; the last transition of a truncated episode keeps its discount.
     """

@@ -19,7 +19,7 @@ class RecurrentLearner(Learner):
 
     The network's memory is recomputed with the latest weights, from zero over a burn-in without gradients; R2D2 also
     tries stored memories, which the replay memory does not hold. A sequence's loss is the sum over its transitions,
-    divided by `unroll`; a transition counts once, however many places it fills.
+    divided by `unroll`; a transition counts once, however many places it fills, except in the statistics of values.
 
     ahead: steps of a sequence after the last one to learn. Other arguments as for `Learner`.
     """
@@ -49,15 +49,19 @@ class RecurrentLearner(Learner):
         actions = self._sent(a_t).flatten()
 
         def values_at(network: nn.Module) -> QFunction:
-            return lambda at_BL: cast(Recurrent, network).sequence(x, nothing, first_B)[0][rows_B1, at_BL].flatten(0, 1)
+            def values(at: torch.Tensor) -> torch.Tensor:
+                q_BT, _ = cast(Recurrent, network).sequence(x, nothing, first_B)
+                return q_BT.float()[rows_B1, at.view(size, unroll)].flatten(0, 1)
+
+            return values
 
         with torch.no_grad():
             target = self.objective.targets(
                 self._floats(r_t).flatten(),
-                step_BL + self._sent(m),
+                (step_BL + self._sent(m)).flatten(),
                 self._floats(discount).flatten(),
-                lambda at: values_at(online)(at).float(),
-                lambda at: values_at(target_network)(at).float(),
+                values_at(online),
+                values_at(target_network),
             )
             _, h = cast(Recurrent, online).sequence(x[:, :burn_in], nothing, first_B)
         online.train()
@@ -73,5 +77,6 @@ class RecurrentLearner(Learner):
     def _two_samples(self, state: tuple[int, int, int]) -> tuple[npt.NDArray[Any], ...]:
         unroll, length = self.core.unroll, self.core.burn_in + self.core.unroll + self._ahead
         zeros = np.zeros((2, unroll), np.float32)
-        ends, whole = np.zeros((2, 2), np.int64), np.zeros((2, unroll), np.int64)
-        return np.zeros((2, length, *state), np.uint8), *ends, whole, zeros, whole, zeros
+        first, last = np.zeros(2, np.int64), np.full(2, self.core.burn_in + unroll - 1)
+        whole = np.zeros((2, unroll), np.int64)
+        return np.zeros((2, length, *state), np.uint8), first, last, whole, zeros, whole, zeros

@@ -29,7 +29,7 @@ class Recurrent(Protocol):
     """A network with a memory (B, units), which is zero when an episode begins."""
 
     units: int
-    burn_in: int  # steps before those to learn, which only recompute the memory
+    burn_in: int  # steps before those to learn, at least one, which only recompute the memory
     unroll: int  # steps to learn at once
 
     def sequence(

@@ -11,7 +11,7 @@ from atlantis_exp.networks.heads import Head
 class DQNCnnGru(DQNCnn):
     """DQNCnn with a gated recurrent unit before its head; R2D2 has an LSTM there (Kapturowski et al. 2019).
 
-    Maps states as DQNCnn does, each as an episode's first; `sequence` remembers.
+    `forward` takes each state as an episode's first; `sequence` carries the memory on.
 
     Args:
         units: numbers in the memory.

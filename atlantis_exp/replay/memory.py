@@ -64,7 +64,8 @@ class Window(NamedTuple):
 class Sequences(NamedTuple):
     """A batch of B sequences of T states, of which L follow a burn-in and are learned.
 
-    Places before an episode's oldest stored transition or after its latest one are filled with that one.
+    Before an episode's oldest stored transition its state is repeated, after the latest one the state that followed it;
+    actions, rewards and discounts repeat those of the nearest transition.
     """
 
     states: npt.NDArray[np.uint8]  # (B, T, stack, H, W)
@@ -192,6 +193,7 @@ class ReplayMemory:
 
         So the ends of episodes are learned half as often as the rest. Raises: ValueError if one is not available.
         """
+        self._successors(ids)
         middle, length = window.burn_in + window.unroll // 2, window.burn_in + window.unroll
         chain, first = [ids], np.full(len(ids), middle)  # newest first
         for _ in range(middle):

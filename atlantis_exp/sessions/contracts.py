@@ -25,6 +25,7 @@ from atlantis_exp.config import ComponentConfig, Config
 from atlantis_exp.faults import Fault
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.learning.objectives import DQN, Quantile
+from atlantis_exp.learning.values import Recurrent
 from atlantis_exp.networks.dropout import seed_dropout
 from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
 from atlantis_exp.networks.sizes import count_parameters
@@ -90,6 +91,8 @@ def contracts_of(config: Config, small: Job, kinds: Collection[str]) -> Iterator
         yield network, "draws no global random numbers", partial(_network_draws_nothing, config)
         if config.model.component is not None and config.model.component.facts["splits_batches"]:
             yield network, "a split batch gives the same values", partial(_splits, config)
+        if config.model.component is not None and hasattr(config.model.component.load(), "sequence"):
+            yield network, "a sequence is its steps, without memory before its first", partial(_remembers, config)
     if "objective" in kinds:
         objective = f"objective={config.objective.name}"
         yield objective, "one finite target and loss per sample", partial(_objective_is_whole, config)
@@ -186,6 +189,19 @@ def _splits(config: Config) -> None:
     states = _states(config, 6)
     whole, parted = (_made(config, config.env.size).train() for _ in range(2))
     torch.testing.assert_close(torch.cat([parted(states[:2]), parted(states[2:])]), whole(states), rtol=1e-4, atol=1e-5)
+
+
+def _remembers(config: Config) -> None:
+    network = _made(config, config.env.size).eval()
+    if not isinstance(network, Recurrent):
+        raise TypeError("a network with a method sequence needs units, burn_in and unroll")
+    x, nothing = _states(config, 6).unflatten(0, (2, 3)), torch.zeros(2, network.units)  # type: ignore[no-untyped-call]
+    with torch.no_grad():
+        whole, _ = network.sequence(x, nothing, torch.tensor([0, 1]))
+        h = torch.ones_like(nothing)
+        for t in range(3):
+            step, h = network.sequence(x[:, t : t + 1], h, torch.tensor([0 - t, 1 - t]))
+            torch.testing.assert_close(step[:, 0], whole[:, t], rtol=1e-4, atol=1e-5)
 
 
 def _values(config: Config, seed: int) -> torch.Tensor:
@@ -312,12 +328,13 @@ def fingerprints(config: Config, outputs: Path) -> dict[str, str]:
 def _cost(name: str, job: Job, said: str) -> documents.Cost:
     """Measure a training on this machine; an update includes drawing its batch."""
     trainer, speed = measure(job, said=said)
-    batch = job.config.training.batch_size
+    batch, window = job.config.training.batch_size, trainer.plan.window
+    samples = batch * (window.unroll if window else 1)
     return documents.Cost(
         component=name,
         pixels=job.config.env.size,
         parameters=count_parameters(trainer.learner.network),
-        flops_per_sample=trainer.learner.update_flops(job.config.env.state_shape, batch) / batch,
+        flops_per_sample=trainer.learner.update_flops(job.config.env.state_shape, batch) / samples,
         updates_per_second=speed.updates_per_second,
         steps_per_second=speed.steps_per_second,
     )

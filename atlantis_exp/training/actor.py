@@ -11,7 +11,7 @@ Generators = Sequence[np.random.Generator]
 States = npt.NDArray[np.uint8]  # (B, stack, size, size)
 Values = npt.NDArray[np.float32]  # (B, actions)
 Memory = npt.NDArray[np.float32]  # (B, units)
-NONE: Memory = np.empty((0, 0), np.float32)
+NO_MEMORY: Memory = np.empty((0, 0), np.float32)
 
 
 class Decisions(NamedTuple):
@@ -25,7 +25,7 @@ class Decisions(NamedTuple):
 class Actor(Protocol):
     """Choose an action for each of B states; state b draws only from the b-th generator.
 
-    A player of `units` remembers earlier states of an episode: it reads `memory` and writes it.
+    A player whose `units` is not 0 remembers earlier states of an episode: `act` reads `memory` and overwrites it.
     """
 
     @property
@@ -46,7 +46,7 @@ class EpsilonGreedy:
     num_actions: int
     watches: bool = False
 
-    def act(self, states: States, epsilon: float, generators: Generators, memory: Memory = NONE) -> Decisions:  # noqa: ARG002
+    def act(self, states: States, epsilon: float, generators: Generators, memory: Memory = NO_MEMORY) -> Decisions:  # noqa: ARG002
         random = np.array([generator.random() < epsilon for generator in generators])
         actions = np.empty(len(states), np.int64)
         for row in np.flatnonzero(random).tolist():
@@ -83,7 +83,7 @@ class RandomActor:
     units: ClassVar[int] = 0
     num_actions: int
 
-    def act(self, states: States, epsilon: float, generators: Generators, memory: Memory = NONE) -> Decisions:  # noqa: ARG002
+    def act(self, states: States, epsilon: float, generators: Generators, memory: Memory = NO_MEMORY) -> Decisions:  # noqa: ARG002
         actions = np.array([generator.integers(self.num_actions) for generator in generators], np.int64)
         return Decisions(actions, np.ones(len(states), np.bool_))
 
@@ -96,7 +96,7 @@ class PersonActor:
     screen: Callable[[], npt.NDArray[np.uint8]]
     choose: Callable[[npt.NDArray[np.uint8]], int]
 
-    def act(self, states: States, epsilon: float, generators: Generators, memory: Memory = NONE) -> Decisions:  # noqa: ARG002
+    def act(self, states: States, epsilon: float, generators: Generators, memory: Memory = NO_MEMORY) -> Decisions:  # noqa: ARG002
         return Decisions(np.array([self.choose(self.screen())], np.int64), np.zeros(1, np.bool_))
 
 
@@ -107,5 +107,5 @@ class ConstantActor:
     units: ClassVar[int] = 0
     action: int
 
-    def act(self, states: States, epsilon: float, generators: Generators, memory: Memory = NONE) -> Decisions:  # noqa: ARG002
+    def act(self, states: States, epsilon: float, generators: Generators, memory: Memory = NO_MEMORY) -> Decisions:  # noqa: ARG002
         return Decisions(np.full(len(states), self.action, np.int64), np.zeros(len(states), np.bool_))

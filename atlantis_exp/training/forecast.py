@@ -114,6 +114,8 @@ def forecast(
     replay_bytes = int(min(max_bytes, min(capacity, done.steps + steps) * an_observation))
     loaded = trainer.memory.next_id - trainer.memory.oldest_id  # observations of a continued run
     more_bytes = max(0, replay_bytes - int(loaded * an_observation))
+    # The states of a batch as bytes and float32, and what the first layer makes of them.
+    sequences = 12 * plan.batch_size * sum(plan.window) * len(lags) * size**2 if plan.window else 0
     weights = sum(tensor.nbytes for tensor in learner.network.state_dict().values())
     cadence = trainer.recorder.cadence
     evaluations = 1 + steps / (cadence.evaluate_steps or math.inf)
@@ -123,7 +125,7 @@ def forecast(
         steps_per_second=1 / seconds_a_step,
         updates_per_second=1 / update_seconds,
         steps=steps,
-        memory=more_bytes + _WARM_MEMORY,
+        memory=more_bytes + _WARM_MEMORY + sequences,
         memory_available=psutil.virtual_memory().available,
         # Two generations of all networks and two moments; each evaluation's weights, in the folder and in MLflow.
         disk=int(more_bytes + (10 if learner.ema else 8) * weights + 2 * evaluations * weights),

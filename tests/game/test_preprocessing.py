@@ -1,4 +1,5 @@
 import hashlib
+from typing import Any
 
 import cv2
 import numpy as np
@@ -157,18 +158,19 @@ operations = st.lists(
 def test_a_frame_stack_equals_lists_of_whole_histories(
     operations: list[tuple[str, list[int], int]], lags: tuple[int, ...]
 ) -> None:
-    stack = FrameStack(3, 2, lags)
-    histories = [[0] * 7 for _ in range(3)]
+    stack = FrameStack(3, 2, lags, units=1)
+    histories, memory = [[0] * 7 for _ in range(3)], np.zeros((3, 1))
     handed_out = []
     for value, (operation, order, count) in enumerate(operations, start=1):
         envs = tuple(order[:count])
         if operation == "reset":
             stack.reset(envs, frames(*(10 * value + env for env in envs)))
             for env in envs:
-                histories[env] = [10 * value + env] * 7
+                histories[env], memory[env] = [10 * value + env] * 7, 0
         elif operation == "restore":
-            restored = FrameStack(3, 2, lags)
-            restored.load_state_dict(stack.state_dict())
+            restored, kept = FrameStack(3, 2, lags, units=1), stack.state_dict()
+            stack.memory[:] = -1
+            restored.load_state_dict(kept)
             stack = restored
         else:
             envs = (0, 1, 2) if operation == "push" else envs
@@ -177,7 +179,18 @@ def test_a_frame_stack_equals_lists_of_whole_histories(
             observations[:] = 255
             for env in envs:
                 histories[env].append(10 * value + env)
+        np.testing.assert_array_equal(stack.memory, memory)
+        stack.memory[:] = memory[:] = value
         handed_out.append((stack.state, [[history[-1 - lag] for lag in reversed(lags)] for history in histories]))
     for state, expected in handed_out:
         assert state[:, :, 0, 0].tolist() == expected
         assert state[:, :, 1, 1].tolist() == expected
+
+
+@pytest.mark.parametrize(
+    "memory", [np.zeros((3, 2), np.float32), np.zeros((3, 1)), np.full((3, 1), np.nan, np.float32)]
+)
+def test_a_memory_of_another_size_or_type_or_of_no_numbers_is_refused(memory: npt.NDArray[Any]) -> None:
+    state = FrameStack(3, 2, units=1).state_dict()
+    with pytest.raises(ValueError, match="the player's memory"):
+        FrameStack(3, 2, units=1).load_state_dict({**state, "memory": memory})

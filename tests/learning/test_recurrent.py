@@ -21,11 +21,16 @@ QUANTILE: Head = partial(QuantileHead, quantiles=5)
 Batch = tuple[npt.NDArray[Any], ...]
 
 
-def _learner(objective: Objective = DoubleDQN(), head: Head = nn.Linear, **options: Any) -> RecurrentLearner:  # noqa: B008
+def _learner(
+    objective: Objective = DoubleDQN(),  # noqa: B008 - frozen
+    head: Head = nn.Linear,
+    burn_in: int = BURN_IN,
+    **options: Any,
+) -> RecurrentLearner:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         network, target = (
-            DQNCnnGru((2, SIDE, SIDE), 3, head, units=8, burn_in=BURN_IN, unroll=UNROLL) for _ in range(2)
+            DQNCnnGru((2, SIDE, SIDE), 3, head, units=8, burn_in=burn_in, unroll=UNROLL) for _ in range(2)
         )
     optimizer = torch.optim.SGD(network.parameters(), lr=0.1)
     return RecurrentLearner(network, target, optimizer, objective, 0.5, ahead=AHEAD, **options)
@@ -121,7 +126,9 @@ def test_acting_step_by_step_is_the_sequence_and_the_average_acts_by_its_own_wei
 def test_flops_count_every_state_of_a_sequence_once_a_pass() -> None:
     with FlopCounterMode(display=False) as counter:
         _learner(DQN()).update(*_batch())
-    assert _learner(DQN()).update_flops((2, SIDE, SIDE), 5) == counter.get_total_flops()
+    flops = counter.get_total_flops()
+    assert _learner(DQN()).update_flops((2, SIDE, SIDE), 5) == flops
+    assert _learner(DQN(), burn_in=2 * UNROLL).update_flops((2, SIDE, SIDE), 5) > flops
 
 
 def test_bfloat16_learns_and_remembers() -> None:

@@ -330,6 +330,14 @@ def test_a_transition_that_is_not_available_is_refused() -> None:
             memory.rewards(np.array([k]))
 
 
+def test_a_sequence_around_what_is_no_available_transition_is_refused() -> None:
+    memory = played(memory_of(30), 60)
+    latest = max(memory._newest.values())
+    for k in (memory.oldest_id - 1, latest, memory.next_id):
+        with pytest.raises(ValueError, match="not available"):
+            memory.gather_sequences(np.array([k]), ONE_STEP, Window(2, 4, 1))
+
+
 def test_no_transition_aliases_the_observations_it_came_from_nor_the_batch_it_went_to() -> None:
     """The report's `stack_frame` shifts in place, so that every stored state of an episode is its last one."""
     memory = memory_of(20)

@@ -79,6 +79,13 @@ class Half:
         return 0.5
 """
 CHOSEN = ("model=mine", "objective=mine", "sampler=mine", "epsilon=mine", "lr_schedule=mine")
+FORWARD = "    def forward(self, x):"
+SEQUENCE = """    units, burn_in, unroll = 4, 1, 2
+
+    def sequence(self, x, h, first):
+        return torch.stack([self(x[:, t]) for t in range(x.shape[1])], 1), h
+
+"""
 BREACHES = [  # what a part is replaced by, and the contracts that it breaks
     ("", "", ()),
     ("nn.ReLU())", "nn.Dropout(0.5))", ("draws no global random numbers", "a split batch gives the same values")),
@@ -91,6 +98,9 @@ BREACHES = [  # what a part is replaced by, and the contracts that it breaks
         "self.level = float(torch.ones(1).sum()); self.layers = ",
         ("loads its saved weights, also on meta",),
     ),
+    (FORWARD, SEQUENCE + FORWARD, ()),
+    (FORWARD, SEQUENCE.replace("units", "size") + FORWARD, ("a sequence is its steps",)),
+    (FORWARD, SEQUENCE.replace("1), h", "1) + h.sum(), h") + FORWARD, ("a sequence is its steps",)),
     ("self.head(self", "random.random() * self.head(self", ("draws no global random numbers",)),
     (
         "(DQN):\n    pass",

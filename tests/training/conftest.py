@@ -104,12 +104,15 @@ class Remembering(nn.Module):
         self.core = nn.GRUCell(len(lags) * SIZE * SIZE, self.units)
         self.head = nn.Linear(self.units, NUM_ACTIONS)
 
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.sequence(x.unsqueeze(1), torch.zeros(len(x), self.units), torch.zeros(len(x)))[0][:, 0]
+
     def sequence(self, x: torch.Tensor, h: torch.Tensor, first: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         values = []
         for t in range(x.shape[1]):
             h = self.core(x[:, t].flatten(1), h * (t > first).unsqueeze(1))
             values.append(self.head(h))
-        return torch.stack(values, 1) if values else x.new_zeros(len(x), 0, NUM_ACTIONS), h
+        return torch.stack(values, 1), h
 
 
 PLAN = Plan(

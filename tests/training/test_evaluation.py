@@ -12,7 +12,7 @@ from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.config import Config
 from atlantis_exp.game.vector import Emulators, make_emulators
 from atlantis_exp.training.actor import (
-    NONE,
+    NO_MEMORY,
     Actor,
     Decisions,
     EpsilonGreedy,
@@ -93,7 +93,7 @@ def test_the_actor_decides_for_one_half_while_the_other_is_emulated(
     tape: list[str] = []
 
     class Watched(RandomActor):
-        def act(self, states: States, epsilon: float, generators: Generators, memory: Memory = NONE) -> Decisions:
+        def act(self, states: States, epsilon: float, generators: Generators, memory: Memory = NO_MEMORY) -> Decisions:
             tape.append(f"decide {len(states)}")
             return super().act(states, epsilon, generators, memory)
 

@@ -37,14 +37,14 @@ def expected_of(trainer: Trainer, size: int, **chosen: Any) -> Forecast:
     return forecast(trainer, size=size, lags=range(4), **{**asked, **chosen})
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize(("num_envs", "remembers"), [(1, False), (3, False), (2, True)])
 def test_a_training_with_a_forecast_is_bit_for_bit_the_one_without(
-    small: Callable[..., Trainer], tmp_path: Path, num_envs: int, timed: list[tuple[int, float]]
+    small: Callable[..., Trainer], tmp_path: Path, num_envs: int, remembers: bool, timed: list[tuple[int, float]]
 ) -> None:
     prints, histories = [], []
     for name in ("without", "with"):
         phases = [Phase("quick", 160, 1e-3, PrioritizedSampler(0.5, 0.5))]
-        trainer = small(tmp_path / name, num_envs=num_envs, phases=phases)
+        trainer = small(tmp_path / name, num_envs=num_envs, remembers=remembers, phases=phases)
         if name == "with":
             assert trainer.learner.update_flops((4, 8, 8), 4) > 0
             expected_of(trainer, 8)
@@ -79,6 +79,15 @@ def test_a_step_is_measured_with_its_schedules(
     monkeypatch.setattr(forecast_module, "_median_seconds", median_seconds)
     expected_of(trainer, 8)
     assert during == [1, 0, 0]  # to play, to act, to learn
+
+
+def test_a_network_with_a_memory_sees_every_state_and_needs_room_for_sequences(
+    small: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    trainer = small(tmp_path, num_envs=2, epsilon=lambda *_: 0.5, learn_every=4, remembers=True)
+    expected = expected_of(trainer, 8, max_bytes=1_000)
+    assert expected.steps_per_second == pytest.approx(1 / ((1e-3 + 1e-3) / 2 + 1e-3 / 4))
+    assert expected.memory == 1_000 + 2**29 + 12 * 4 * (2 + 16 + 1) * 4 * 8 * 8
 
 
 def test_what_is_left_is_expected_of_a_training(small: Callable[..., Trainer], tmp_path: Path) -> None:
