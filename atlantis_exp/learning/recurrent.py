@@ -40,34 +40,38 @@ class RecurrentLearner(Learner):
         states, first, last, a_t, r_t, m, discount = batch
         size, unroll, burn_in = len(states), self.core.unroll, self.core.burn_in
         x = self._input(states.reshape(-1, *states.shape[2:])).reshape(states.shape)
+        before, after = x[:, :burn_in], x[:, burn_in:]
         nothing = torch.zeros(size, self.core.units, device=self.device)
-        first_B, last_B = self._sent(first), self._sent(last)
+        first_B, last_B = self._sent(first) - burn_in, self._sent(last) - burn_in  # steps after the burn-in
         rows_B1 = torch.arange(size, device=self.device).unsqueeze(1)
-        step_1L = torch.arange(burn_in, burn_in + unroll, device=self.device).unsqueeze(0)
+        step_1L = torch.arange(unroll, device=self.device).unsqueeze(0)
         step_BL = step_1L.clamp(first_B.unsqueeze(1), last_B.unsqueeze(1))
         is_learned = step_BL == step_1L
         actions = self._sent(a_t).flatten()
 
-        def values_at(network: nn.Module) -> QFunction:
+        def values_of(network: nn.Module, h: torch.Tensor) -> QFunction:
             def values(at: torch.Tensor) -> torch.Tensor:
-                q_BT, _ = cast(Recurrent, network).sequence(x, nothing, first_B)
+                q_BT, _ = cast(Recurrent, network).sequence(after, h, first_B)
                 return q_BT.float()[rows_B1, at.view(size, unroll)].flatten(0, 1)
 
             return values
 
         with torch.no_grad():
+            h, h_target = (
+                cast(Recurrent, network).sequence(before, nothing, first_B + burn_in)[1]
+                for network in (online, target_network)
+            )
             target = self.objective.targets(
                 self._floats(r_t).flatten(),
                 (step_BL + self._sent(m)).flatten(),
                 self._floats(discount).flatten(),
-                values_at(online),
-                values_at(target_network),
+                values_of(online, h),
+                values_of(target_network, h_target),
             )
-            _, h = cast(Recurrent, online).sequence(x[:, :burn_in], nothing, first_B)
         online.train()
-        q_BL, _ = cast(Recurrent, online).sequence(x[:, burn_in : burn_in + unroll], h, first_B - burn_in)
+        q_BL, _ = cast(Recurrent, online).sequence(after[:, :unroll], h, first_B)
         online.eval()
-        q = q_BL.float()[rows_B1, step_BL - burn_in].flatten(0, 1)
+        q = q_BL.float()[rows_B1, step_BL].flatten(0, 1)
         losses = (self.objective.losses(q, actions, target).view(size, unroll) * is_learned).sum(1) / unroll
         q = q.detach()
         errors = td_errors(q, actions, target).view(size, unroll) * is_learned

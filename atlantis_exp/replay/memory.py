@@ -193,7 +193,7 @@ class ReplayMemory:
 
         So the ends of episodes are learned half as often as the rest. Raises: ValueError if one is not available.
         """
-        self._successors(ids)
+        self._successors(ids)  # raises for what is not available
         middle, length = window.burn_in + window.unroll // 2, window.burn_in + window.unroll
         chain, first = [ids], np.full(len(ids), middle)  # newest first
         for _ in range(middle):

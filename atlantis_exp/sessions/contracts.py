@@ -89,9 +89,10 @@ def contracts_of(config: Config, small: Job, kinds: Collection[str]) -> Iterator
         yield network, "same seed, same weights", partial(_same_weights, config)
         yield network, "loads its saved weights, also on meta", partial(_weights_return, config)
         yield network, "draws no global random numbers", partial(_network_draws_nothing, config)
-        if config.model.component is not None and config.model.component.facts["splits_batches"]:
+        component = config.model.component
+        if component is not None and component.facts["splits_batches"]:
             yield network, "a split batch gives the same values", partial(_splits, config)
-        if config.model.component is not None and hasattr(config.model.component.load(), "sequence"):
+        if component is not None and hasattr(component.load(), "sequence"):
             yield network, "a sequence is its steps, without memory before its first", partial(_remembers, config)
     if "objective" in kinds:
         objective = f"objective={config.objective.name}"

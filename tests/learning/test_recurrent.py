@@ -128,6 +128,11 @@ def test_flops_count_every_state_of_a_sequence_once_a_pass() -> None:
         _learner(DQN()).update(*_batch())
     flops = counter.get_total_flops()
     assert _learner(DQN()).update_flops((2, SIDE, SIDE), 5) == flops
+    with FlopCounterMode(display=False) as counter, torch.no_grad():  # of the choice of Double DQN, after the burn-in
+        cast(DQNCnnGru, _learner().network).sequence(
+            torch.zeros(5, UNROLL + AHEAD, 2, SIDE, SIDE), torch.zeros(5, 8), torch.zeros(5)
+        )
+    assert _learner(DoubleDQN()).update_flops((2, SIDE, SIDE), 5) == flops + counter.get_total_flops()
     assert _learner(DQN(), burn_in=2 * UNROLL).update_flops((2, SIDE, SIDE), 5) > flops
 
 
