@@ -17,6 +17,7 @@ import pytest
 from atlantis_exp.build import make_emulator
 from atlantis_exp.sessions.cards import read_card
 from benchmarks import (
+    captured,
     emulation,
     evaluation,
     kills,
@@ -162,6 +163,27 @@ def test_the_flops_of_an_update_are_those_of_its_layers() -> None:
     # multiply-adds of the forward pass by layer; the first convolution has no gradient with regard to its input
     first, others = 20 * 20 * 32 * 4 * 64, 9 * 9 * 64 * 32 * 16 + 7 * 7 * 64 * 64 * 9 + 3136 * 512 + 512 * 4
     assert learner.flops_of(learner.Case("cnn", 2, "fp32").config()) == 2 * 2 * (3 * first + 4 * others)
+
+
+_SMALL = ("training.batch_size=4", "env.size=40", "training.ema=20", "objective.target.every=5", "threads=1")
+
+
+@pytest.mark.parametrize("words", [("model=cnn_small", "objective=double_dqn"), ("model=resnet",)], ids=" ".join)
+def test_a_graph_is_given_all_that_changes_from_update_to_update(words: Sequence[str]) -> None:
+    def once(_: object, work: captured.Work) -> captured.Work:
+        result = work()
+        return lambda: result
+
+    assert captured.are_equal(lambda _, work: work, *words, *_SMALL, updates=12)
+    assert not captured.are_equal(once, *words, *_SMALL, updates=12)
+
+
+@pytest.mark.slow
+def test_captured_rehearses_without_a_gpu(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = f"--rehearse --models cnn_small --rounds 1 --seconds 0.1 {' '.join(_SMALL)}"
+    results = results_of(captured.main, arguments, capsys)["cnn_small"]
+    assert results.pop("equal") is True
+    assert all(results[name] > 0 for name in ("plain", "captured", "captured_alone"))
 
 
 @pytest.mark.slow

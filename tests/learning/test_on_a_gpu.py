@@ -43,6 +43,21 @@ def _batch(seed: int) -> tuple[Any, ...]:
     )
 
 
+def _sequences(seed: int) -> tuple[Any, ...]:
+    """Eight sequences of two steps before four to learn and three after them."""
+    rng = np.random.default_rng(seed)
+    m = rng.integers(1, 4, (8, 4))
+    return (
+        rng.integers(0, 256, (8, 9, 4, 40, 40), dtype=np.uint8),
+        rng.integers(0, 4, 8),
+        rng.integers(4, 6, 8),
+        rng.integers(0, 4, (8, 4)),
+        rng.choice([0, 1], (8, 4)).astype(np.float32),
+        m,
+        np.where(rng.random((8, 4)) < 0.3, 0.0, 0.9**m).astype(np.float32),
+    )
+
+
 def _on_the_processor(node: Any) -> Any:
     """A state as a checkpoint has it, with copies of its tensors."""
     if isinstance(node, dict):
@@ -64,6 +79,34 @@ def test_updates_in_float32_are_the_processor_s(learner: Callable[..., Learner],
         torch.testing.assert_close(*(each.update(*batch).cpu() for each in both), rtol=1e-3, atol=1e-3)
     weights = (_on_the_processor(each.state_dict()["network"]) for each in both)
     torch.testing.assert_close(*weights, rtol=1e-2, atol=2e-4)
+
+
+@every_objective
+def test_updates_of_a_memory_are_the_processor_s_and_never_wait(
+    learner: Callable[..., Learner], objective: str
+) -> None:
+    words = (
+        "model=cnn_gru",
+        "model.units=8",
+        "model.burn_in=2",
+        "model.unroll=4",
+        f"objective={objective}",
+        "objective.n_step=3",
+    )
+    both = [learner(*words, f"device={device}", "training.precision=fp32") for device in ("cuda", "cpu")]
+    for seed in range(3):
+        batch = _sequences(seed)
+        torch.testing.assert_close(*(each.update(*batch).cpu() for each in both), rtol=1e-3, atol=1e-3)
+    weights = (_on_the_processor(each.state_dict()["network"]) for each in both)
+    torch.testing.assert_close(*weights, rtol=1e-2, atol=2e-4)
+    states, nothing = _batch(99)[0], np.zeros((32, 8), np.float32)
+    for ours, theirs in zip(*(each.step(states, nothing) for each in both), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-2, atol=1e-3)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        both[0].update(*_sequences(4))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
 
 
 @every_network
