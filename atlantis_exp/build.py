@@ -123,12 +123,17 @@ def described(config: cfg.Config) -> str:
 
 
 def import_components(config: cfg.Config) -> None:
-    """Import the classes that a config names. Raises: ConfigError if a plugin is not named or cannot be imported."""
+    """Import the classes that a config names.
+
+    Raises: ConfigError if a plugin is not named or cannot be imported, or if the network cannot be compiled.
+    """
     parts: list[cfg.ComponentConfig] = [config.model, config.objective, config.epsilon, config.lr_schedule]
     for part in (*parts, *(config.sampler_of(phase) for phase in config.phase)):
         if part.component is None:
             raise ConfigError(needs(config))
-        part.component.load()
+        cls = part.component.load()
+        if config.compile and part is config.model and hasattr(cls, "sequence"):
+            raise ConfigError(f"compile=true: model={part.name} has a memory; only others can be compiled")
     _num_actions(config)
 
 
@@ -144,6 +149,20 @@ def _check_output(config: cfg.Config, network: nn.Module) -> None:
         made = tuple(network.eval()(torch.zeros(2, *env.state_shape)).shape)
         if made != shape:
             raise TypeError(f"{component.load().__name__} returns {made} for two states; should be {shape}")
+        if hasattr(network, "sequence"):
+            _check_memory(network, env.state_shape, shape)
+
+
+def _check_memory(network: nn.Module, state: tuple[int, ...], shape: tuple[int, ...]) -> None:
+    """Raise TypeError unless a network has sizes, and values of two sequences as of two states."""
+    for name in ("units", "burn_in", "unroll"):
+        if not isinstance(count := getattr(network, name, None), int) or count < 1:
+            raise TypeError(f"{name} is {count}; a network with a method sequence needs an int of at least 1")
+    assert isinstance(network, Recurrent)
+    made = network.sequence(torch.zeros(2, 3, *state), torch.zeros(2, network.units), torch.zeros(2))
+    shapes = tuple(tuple(each.shape) for each in made)
+    if shapes != (should := ((2, 3, *shape[1:]), (2, network.units))):
+        raise TypeError(f"sequence returns {shapes} for two sequences of three states; should be {should}")
 
 
 def _num_actions(config: cfg.Config) -> int:
@@ -201,6 +220,7 @@ def build_optimizer(optimizer: cfg.AdamConfig | cfg.RmsPropConfig, network: nn.M
 
 def build_learner(config: cfg.Config) -> Learner:
     """Return the learner: both networks, the optimizer and the objective."""
+    import_components(config)
     device, target = choose_device(config.device), config.objective.target
     network = build_network(config, "network", device)
     target_network = build_network(config, "target", device)
@@ -208,8 +228,6 @@ def build_learner(config: cfg.Config) -> Learner:
         target_network.load_state_dict(network.state_dict())
     make: Callable[..., Learner] = Learner
     if isinstance(network, Recurrent):
-        if config.compile:
-            raise ConfigError(f"compile=true: model={config.model.name} has a memory; only others can be compiled")
         make = partial(RecurrentLearner, ahead=config.objective.n_step)
     return make(
         network,

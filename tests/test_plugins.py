@@ -465,6 +465,32 @@ def test_a_plugin_that_fails_is_one_line_with_its_file_and_line(
     assert re.search(f"{re.escape(str(plugins / 'mynet.py'))}{line_number}: {reason}", line)
 
 
+MEMORY = """
+    units, burn_in, unroll = 4, 2, 3
+
+    def sequence(self, x, h, first):
+        q = self.forward(x.flatten(0, 1))
+        return q.reshape(*x.shape[:2], *q.shape[1:]), h
+"""
+
+
+@pytest.mark.parametrize(
+    ("part", "instead", "reason"),
+    [
+        ("unroll =", "unrol =", "unroll is None; a network with a method sequence needs an int of at least 1"),
+        ("4, 2, 3", "4, 0, 3", "burn_in is 0; "),
+        ("*x.shape[:2]", "3, 2", r"sequence returns \(\(3, 2, 4\), \(2, 4\)\) for two .*; should be \(\(2, 3, 4\), "),
+        (", h\n", ", h[:1]\n", r"sequence returns \(\(2, 3, 4\), \(1, 4\)\) for two "),
+    ],
+)
+def test_a_memory_that_would_fail_or_be_passed_over_is_one_line(
+    part: str, instead: str, reason: str, plugins: Path, said: Said, tiny_overrides: tuple[str, ...]
+) -> None:
+    (plugins / "mynet.py").write_text(NETWORK + MEMORY.replace(part, instead))
+    line = said(*tiny_overrides, "model=mynet", "plugins=./mynet.py", f"paths.outputs={plugins / 'outputs'}")
+    assert re.search(rf"/mynet\.py:\d+: TypeError: {reason}", line)
+
+
 def test_a_head_of_quantiles_needs_their_number(plugins: Path, said: Said) -> None:
     (plugins / "parts.py").write_text(OTHERS.replace("    caution:", "    head = 'quantile'\n    caution:"))
     assert re.search(r"/parts.py:\d+: TypeError: head = .* needs a setting quantiles", said("plugins=./parts.py"))

@@ -55,7 +55,7 @@ class Forecast:
         if self.memory > self.memory_available:
             return (
                 f"memory will not suffice: {_size(self.memory)} needed, {_size(self.memory_available)} available; "
-                f"lower replay.max_bytes or replay.capacity"
+                f"lower replay.max_bytes, replay.capacity or training.batch_size"
             )
         if self.disk > self.disk_available:
             return (
@@ -76,6 +76,10 @@ def forecast(
     plan, learner, emulators = trainer.plan, trainer.learner, trainer.emulators
     num_envs = emulators.num_envs
     rng = np.random.default_rng(0)
+    available = psutil.virtual_memory().available  # before the updates, which keep theirs
+    # The states of a batch as bytes and float32, and what the first layer makes of them.
+    sequences = 12 * plan.batch_size * sum(plan.window) * len(lags) * size**2 if plan.window else 0
+    measured = plan.batch_size if 2 * sequences <= available else max(1, plan.batch_size * available // sequences // 2)
     memory = ReplayMemory(8_192, (size, size), lags=lags, budget_bytes=8_192 * size * size)
     for env, observation in enumerate(emulators.reset(range(num_envs), [0] * num_envs)):
         memory.begin(env, observation)
@@ -92,14 +96,14 @@ def forecast(
             memory.begin(env, observation)  # else a finished game would be measured
 
     def update() -> None:
-        ids, weights = sampler.sample(memory, plan.batch_size, rng)
+        ids, weights = sampler.sample(memory, measured, rng)
         learner.update(*plan.gather(memory, ids), weights=weights).cpu()  # waits for a GPU
 
     with learner.restored():
         play_seconds = _median_seconds(play, at_least=8, seconds=1.0)
         states = np.zeros((num_envs, len(lags), size, size), np.uint8)
         act_seconds = _median_seconds(lambda: learner.q_values(states), at_least=3, seconds=0.5)
-        update_seconds = _median_seconds(update, at_least=3, seconds=1.0)
+        update_seconds = _median_seconds(update, at_least=3, seconds=1.0) * plan.batch_size / measured
     emulators.reset(range(num_envs), [0] * num_envs)  # a fresh console
 
     usual = 1 if plan.unit == "steps" else emulators.game.episode_steps
@@ -114,8 +118,6 @@ def forecast(
     replay_bytes = int(min(max_bytes, min(capacity, done.steps + steps) * an_observation))
     loaded = trainer.memory.next_id - trainer.memory.oldest_id  # observations of a continued run
     more_bytes = max(0, replay_bytes - int(loaded * an_observation))
-    # The states of a batch as bytes and float32, and what the first layer makes of them.
-    sequences = 12 * plan.batch_size * sum(plan.window) * len(lags) * size**2 if plan.window else 0
     weights = sum(tensor.nbytes for tensor in learner.network.state_dict().values())
     cadence = trainer.recorder.cadence
     evaluations = 1 + steps / (cadence.evaluate_steps or math.inf)
@@ -126,7 +128,7 @@ def forecast(
         updates_per_second=1 / update_seconds,
         steps=steps,
         memory=more_bytes + _WARM_MEMORY + sequences,
-        memory_available=psutil.virtual_memory().available,
+        memory_available=available,
         # Two generations of all networks and two moments; each evaluation's weights, in the folder and in MLflow.
         disk=int(more_bytes + (10 if learner.ema else 8) * weights + 2 * evaluations * weights),
         disk_available=shutil.disk_usage(folder).free,

@@ -3,15 +3,19 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 
+from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.replay.samplers import PrioritizedSampler
 from atlantis_exp.training import forecast as forecast_module
 from atlantis_exp.training.fingerprint import fingerprint, history
 from atlantis_exp.training.forecast import Forecast, forecast
-from atlantis_exp.training.plan import Counters, Phase
+from atlantis_exp.training.plan import Counters, Phase, Plan
 from atlantis_exp.training.trainer import Trainer
 
 GIB = 2**30
@@ -88,6 +92,25 @@ def test_a_network_with_a_memory_sees_every_state_and_needs_room_for_sequences(
     expected = expected_of(trainer, 8, max_bytes=1_000)
     assert expected.steps_per_second == pytest.approx(1 / ((1e-3 + 1e-3) / 2 + 1e-3 / 4))
     assert expected.memory == 1_000 + 2**29 + 12 * 4 * (2 + 16 + 1) * 4 * 8 * 8
+
+
+def test_sequences_that_do_not_fit_are_measured_by_a_part_of_them(
+    small: Callable[..., Trainer], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trainer, sizes = small(tmp_path, remembers=True, epsilon=lambda *_: 0.5, learn_every=4), []
+    a_sequence = 12 * (2 + 16 + 1) * 4 * 8 * 8
+    gather = type(trainer.plan).gather
+
+    def counted(plan: Plan, memory: ReplayMemory, ids: npt.NDArray[np.int64]) -> Any:
+        sizes.append(len(ids))
+        return gather(plan, memory, ids)
+
+    monkeypatch.setattr(type(trainer.plan), "gather", counted)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=5 * a_sequence))
+    expected = expected_of(trainer, 8)
+    assert {*sizes} == {2}  # of four: they take at most half of the memory
+    assert expected.updates_per_second == pytest.approx(1 / 2e-3)
+    assert (expected.shortage or "").startswith("memory will not suffice")
 
 
 def test_what_is_left_is_expected_of_a_training(small: Callable[..., Trainer], tmp_path: Path) -> None:
