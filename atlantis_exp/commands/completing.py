@@ -1,6 +1,7 @@
 """Complete verbs, groups, options, keys and run names for a shell, without loading anything heavy."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from atlantis_exp.commands import VERBS, default_outputs
@@ -52,8 +53,9 @@ def candidates(words: Sequence[str]) -> list[str]:
 
 def _values(verb: str, key: str, before: Sequence[str]) -> Iterator[str]:
     yield from options_of(key)
-    if (key == "run" and verb in ("evaluate", "export")) or (key == "runs" and verb == "compare"):
+    if (key == "run" and verb in ("evaluate", "export")) or (key == "runs" and verb in ("compare", "report")):
         typed = [text.partition("=")[2] for text in before if text.startswith("paths.outputs=")]
-        folder = Path(typed[-1]).expanduser() if typed else default_outputs()
-        names = sorted(path.name for path in (folder / "runs").glob("*/"))
-        yield from (name for name in names if name.isprintable())
+        with suppress(RuntimeError):  # from a home folder that does not exist
+            folder = Path(typed[-1]).expanduser() if typed else default_outputs()
+            names = sorted(path.name for path in (folder / "runs").glob("*/"))
+            yield from (name for name in names if name.isprintable())

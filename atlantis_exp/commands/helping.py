@@ -73,7 +73,7 @@ def _of_group(name: str, option: str) -> Iterator[str]:
     folder, _, package = name.partition("@")
     yield f"{name}={option}   ({', '.join(options_of(name))})"
     path = CONF / folder / f"{option}.yaml"
-    if not package and path.is_file():
+    if not package and option in options_of(name):
         yield from _keys(path, "" if "@package _global_" in path.read_text("utf-8") else f"{folder}.")
 
 

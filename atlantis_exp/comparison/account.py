@@ -36,6 +36,7 @@ class Asked:
     score: str = "last"  # as in `Question`
     window: float | None = None
     scores: str = ""  # the table of groups without recipes
+    columns: dict[str, str] = field(default_factory=dict)  # of that table, by group, seed and score
     name: str = ""
     record: Record = field(default_factory=dict)
 
@@ -55,8 +56,10 @@ class Asked:
 
     @property
     def measure(self) -> tuple[object, ...]:
-        """The score, and the difference that does not matter."""
-        return self.score, self.window, self.delta, self.relative, self.relative and self.baseline
+        """The score with its columns, and the difference that does not matter."""
+        renamed = sorted((key, name) for key, name in self.columns.items() if key != name)
+        score = self.score, self.window, tuple(renamed)
+        return *score, self.delta, self.relative, self.relative and self.baseline
 
     @property
     def spent(self) -> float:

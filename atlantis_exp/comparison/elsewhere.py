@@ -32,9 +32,8 @@ def read_scores(path: Path, columns: Mapping[str, str]) -> list[Group]:
         header = reader.fieldnames or []
         for key, name in columns.items():
             if header.count(name) != 1:
-                which = "no such column" if name not in header else "several such columns"
-                which += f"; {nearest(name, header)}; set columns={key}=NAME"
-                raise ValueError(f"row 1, column {name}: {which}")
+                which = "several such columns" if name in header else f"no such column; {nearest(name, header)}"
+                raise ValueError(f"row 1, column {name}: {which}; set columns={key}=NAME")
         for row in reader:
             label, seed, score = (_read(reader.line_num, row, columns, key) for key in _COLUMNS)
             found[str(label)][int(seed)].append(float(score))

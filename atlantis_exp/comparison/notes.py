@@ -22,7 +22,7 @@ from atlantis_exp.comparison.decision import (
 from atlantis_exp.comparison.gather import AXES, StoredRun, Training
 from atlantis_exp.comparison.published import Table, random_line
 from atlantis_exp.comparison.verdict import Answer, Group, Question
-from atlantis_exp.comparison.words import IN_FULL, listed, margin, measure, spent
+from atlantis_exp.comparison.words import IN_FULL, listed, margin, measure, points, spent
 from atlantis_exp.components import Component, facts_of
 from atlantis_exp.runs.folder import LOST
 from atlantis_exp.terminal import PROGRAM
@@ -104,7 +104,7 @@ def conditions(facts: Facts) -> Iterator[str]:
             found = condition(verdict, look, answer.family.seeds)
             yield (
                 f"{one} against {other}: a look overstates the difference that it finds; the true one is rather "
-                f"{abs(size_found(verdict, look)):,.0f} points. The verdict assumes that seeds vary alike (here "
+                f"{points(abs(size_found(verdict, look)))} points. The verdict assumes that seeds vary alike (here "
                 f"{found.spreads:.1f} times as much in one group). It would not hold if {found.undone_by:.0%} of the "
                 f"seeds of {one} collapsed; {verdict.seeds} seeds cannot exclude up to {found.unseen:.0%}."
             )
@@ -166,8 +166,8 @@ def modes_found(facts: Facts) -> Iterator[str]:
                 "points per frame"
             )
             yield (
-                f"{group.label} falls into two modes: {found.share:.0%} of its seeds score {found.upper:,.0f} on "
-                f"average, the others {found.lower:,.0f}{episodes or ''}."
+                f"{group.label} falls into two modes: {found.share:.0%} of its seeds score {points(found.upper)} on "
+                f"average, the others {points(found.lower)}{episodes or ''}."
             )
 
 

@@ -168,7 +168,8 @@ def _table(**columns: npt.ArrayLike) -> Table:
 
 def _sentences(answers: Sequence[Answer], groups: Sequence[str], question: Question) -> list[str]:
     if not answers:
-        return [f"There is one group only ({groups[0]}), so there is nothing to compare; by=KEY splits it."]
+        splits = "" if question.score == "file" else "; by=KEY splits it"
+        return [f"There is one group only ({groups[0]}), so there is nothing to compare{splits}."]
     way = "" if question.score != "training" else f"by score=training window={100 * question.window:g}%"
     keys = [f"by {each.family.name}" if len(answers) > 1 else "" for each in answers]
     ways = [", ".join(filter(None, (way, key))) for key in keys]

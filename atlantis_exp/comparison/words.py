@@ -68,10 +68,13 @@ def _undecided(answer: Answer, verdicts: Sequence[Verdict], in_full: bool) -> st
         if len(sizes := {*there.values()}) == 1:
             which = f" (there are {min(sizes)} each)"
         return f"{text}; next look at {decision.next_look} seeds{which}"
-    reach = max((verdict.detectable or 0.0 for verdict in verdicts), default=0.0)
-    if not reach:
-        return f"{text}, and there is no further look; the detectable difference is unknown, since seeds do not differ"
-    return f"{text}, and there is no further look; a difference of {points(reach)} would have been found with 80 %"
+    text += ", and this plan has no further look"
+    reaches = [verdict.detectable for verdict in verdicts if verdict.detectable is not None]
+    if not reaches:  # its last look was one of a longer plan
+        return text
+    if not any(reaches):
+        return f"{text}; the detectable difference is unknown, since seeds do not differ"
+    return f"{text}; a difference of {points(max(reaches))} would have been found with 80 %"
 
 
 def spent(answer: Answer) -> str:

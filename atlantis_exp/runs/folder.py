@@ -134,7 +134,7 @@ class RunFolder:
         if steps is not None and result.steps - config.env.num_envs >= steps:
             return f"budget.steps={steps}", f"{result.steps:,} steps"
         flops, done = result.counts.get("flops", 0), result.counts.get("updates", 0)
-        if most is not None and flops and flops * (1 - updates / done) >= most:
+        if most is not None and flops and done and flops * (1 - updates / done) >= most:
             return f"budget.flops={most:g}", f"{flops:.4g} FLOPs"
         return None
 

@@ -181,6 +181,8 @@ def _metrics(comparison: Comparison) -> dict[str, float]:
     for row in comparison.tables["verdict"]:
         if row["seeds"]:
             pair = f"difference/{_slug([row['group']])} over {_slug([row['other']])}"
+            if pair in metrics:  # other names with the same letters, or another family's pair
+                pair += f" {len(metrics) // 2}"
             metrics |= {pair: row["difference"], f"{pair}/decided": float(row["said"] != "not decided")}
     return metrics
 

@@ -22,6 +22,7 @@ from atlantis_exp.comparison.estimands import score_of
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.comparison.tables import Comparison
 from atlantis_exp.comparison.verdict import Group, Question, families, wanted
+from atlantis_exp.comparison.words import points
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
@@ -324,14 +325,15 @@ def _spread(contest: Contest) -> tuple[float, str] | None:
 def _write(journal: Journal, contest: Contest, comparison: Comparison) -> None:
     """Write the looks taken and the answer to the page."""
     table = ["| look at seeds | pair | said | difference | interval | error spent |", f"|{' --- |' * 6}"] + [
-        f"| {look.size} | {verdict.group} over {verdict.other} | {verdict.said} | {verdict.difference:,.0f} "
-        f"| {verdict.low:,.0f} to {verdict.high:,.0f} | {look.error:.2%} |"
+        f"| {look.size} | {verdict.group} over {verdict.other} | {verdict.said} | {points(verdict.difference)} "
+        f"| {points(verdict.low)} to {points(verdict.high)} | {look.error:.2%} |"
         for answer in comparison.answers
         for look in answer.decision.looks
         for verdict in look.verdicts
     ]
     commands = [f"Continue or report: `{contest.command}`", f"Compare its runs again: `{contest.comparing}`"]
     journal.tags({"verdict": comparison.verdict})
-    said = [comparison.verdict, *comparison.others, *comparison.caveats]
-    journal.note("\n\n".join([*said, "\n".join(table), *commands]))
+    # MLflow cuts a long note, so what the comparison's page has, too, comes last.
+    said = [comparison.verdict, *commands, *comparison.others, *comparison.caveats]
+    journal.note("\n\n".join([*said, "\n".join(table)]))
     journal.flush()

@@ -85,10 +85,7 @@ def _last_evaluation(run: RunFolder) -> tuple[int, Mapping[str, float]]:
 
 
 def _cells(reported: Reported) -> list[str]:
-    if not (evaluation := reported.evaluation):
-        return []
-    return [
-        *(f"{evaluation[f'evaluation/{point}']:,.0f}" for point in TABLE_COLUMNS),
-        f"{evaluation['actions/random_share']:.1%}",
-        f"{evaluation['evaluation/episodes']:.0f}",
-    ]
+    formats = {f"evaluation/{point}": ",.0f" for point in TABLE_COLUMNS}
+    formats |= {"actions/random_share": ".1%", "evaluation/episodes": ".0f"}
+    there = reported.evaluation  # without numbers that are not finite
+    return [f"{there[key]:{form}}" if key in there else "" for key, form in formats.items()]

@@ -31,7 +31,9 @@ def test_run_names_are_offered_but_for_those_that_no_terminal_shows(tmp_path: Pa
     for name in ("cnn-1", "cnn-2", "resnet-1", "cnn-\x1b[2J"):
         (tmp_path / "runs" / name).mkdir(parents=True)
     assert candidates(["evaluate", f"paths.outputs={tmp_path}", "run=cnn"]) == ["run=cnn-1", "run=cnn-2"]
-    assert candidates(["compare", f"paths.outputs={tmp_path}", "runs=cnn-1,res"]) == ["runs=cnn-1,resnet-1"]
+    for verb in ("compare", "report"):
+        assert candidates([verb, f"paths.outputs={tmp_path}", "runs=cnn-1,res"]) == ["runs=cnn-1,resnet-1"]
+    assert candidates(["evaluate", "paths.outputs=~no-one-s/", "run=cnn"]) == []
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")

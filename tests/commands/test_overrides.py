@@ -302,7 +302,7 @@ def test_a_sweep_kept_in_a_file_is_the_one_typed_out(tmp_path: Path) -> None:
     assert len(check("config", Config, found[:-1])) == 8
 
 
-@pytest.mark.parametrize("text", ["", "a", "- 1", "a: [", "a: !!python/name:os.system", None])
+@pytest.mark.parametrize("text", ["", "a", "- 1", "a: [", "a: !!python/name:os.system", "a: 2024-01-01", None])
 def test_a_file_that_is_no_sweep_is_one_line(tmp_path: Path, text: str | None) -> None:
     if text is not None:
         (tmp_path / "mine.yaml").write_text(text)

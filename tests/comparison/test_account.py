@@ -264,3 +264,5 @@ def test_groups_of_a_table_are_those_of_the_same_table_only() -> None:
     asked = Asked(["group"], 0.05, None, False, None, ["a", "b"], [], score="file", scores="/x.csv")
     assert asked.identities == {"a": ("/x.csv", "a"), "b": ("/x.csv", "b")}
     assert asked.measure != replace(asked, score="training").measure
+    assert asked.measure == replace(asked, columns={"score": "score"}).measure
+    assert asked.measure != replace(asked, columns={"score": "return"}).measure

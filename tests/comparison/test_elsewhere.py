@@ -35,7 +35,7 @@ def test_columns_may_have_other_names(tmp_path: Path) -> None:
             "row 1, column score: no such column; did you mean 'scor'? (valid: group, scor, seed); "
             "set columns=score=NAME",
         ),
-        ("group,seed,score,score\na,1,2,3\n", "row 1, column score: several such columns"),
+        ("group,seed,score,score\na,1,2,3\n", "row 1, column score: several such columns; set columns="),
         ("", "row 1, column group: no such column"),
         ("group,seed,score\n", "row 2, column group: no row below the header"),
         ("group,seed,score\na,1,2\na,2,two\n", "row 3, column score: 'two' is not a number"),

@@ -319,7 +319,7 @@ def test_looks_are_taken_where_they_are_planned_and_the_same_seeds_charge_nothin
     (each,) = last.answers
     assert [look.size for look in each.decision.looks] == [5, 10]
     assert each.decision.spent == pytest.approx(0.05)
-    assert "and there is no further look; a difference of" in last.verdict
+    assert "and this plan has no further look; a difference of" in last.verdict
     assert "would have been found with 80 %." in last.verdict
     assert [(row["look"], row["seeds"]) for row in last.tables["looks"]] == [(1, 5), (2, 10)]
     widths = [row["high"] - row["low"] for row in last.tables["looks"]]
@@ -351,6 +351,14 @@ def test_what_would_have_been_found_is_not_said_of_seeds_that_do_not_differ() ->
     last = compared(runs, seeds=5).verdict
     assert last.endswith("the detectable difference is unknown, since seeds do not differ.")
     assert "80 %" not in last
+
+
+def test_a_shorter_plan_than_that_of_the_looks_taken_says_only_that_it_has_no_look_left() -> None:
+    runs = [*around("cnn", 3_000.0, range(10)), *around("resnet", 3_015.0, range(10))]
+    longer = compared(runs, seeds=20)
+    last = compared(runs, seeds=10, record=record_of(longer)).verdict
+    assert record_of(longer)["model"][-1].size == 10
+    assert last.endswith("10 seeds each), and this plan has no further look.")
 
 
 def test_a_difference_within_delta_is_a_verdict_too() -> None:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from atlantis_exp.comparison.estimands import score_of
 from atlantis_exp.config import Config
 from atlantis_exp.documents import Compared
 from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.runs.journal import Metrics
 from atlantis_exp.sessions import comparing
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.training import train
@@ -229,6 +231,30 @@ def test_a_table_of_scores_is_drawn_with_its_seeds_and_nothing_else(tmp_path: Pa
     assert r"difference (points)" in (page.parent / "tables" / "scores.tex").read_text()
     for heading in ("Why", "Episodes", "Runs", "Learning"):
         assert f"<h2>{heading}" not in page.read_text()
+
+
+def test_another_column_of_a_table_is_another_question_in_points_as_small_as_its_own(
+    tmp_path: Path, of_json: Callable[..., Compared]
+) -> None:
+    two = (("x", 0.8, 0.3), ("y", 0.3, 0.8))
+    rows = [f"{group},{seed},{a + seed / 100},{b + seed / 100}" for group, a, b in two for seed in range(5)]
+    table = tmp_path / "two.csv"
+    table.write_text("\n".join(["group,seed,a,b", *rows]))
+    for column, leader in (("a", "x over y"), ("b", "y over x")):
+        answer = of_json(f"scores={table}", f"columns=score={column}")
+        assert answer.verdict.startswith(f"{leader[0]} plays better than {leader[-1]} by 0.5 points")
+        assert not any("past looks" in caveat for caveat in answer.caveats)
+        assert any(re.search(r"the true one is rather 0\.\d+ points", caveat) for caveat in answer.caveats)
+
+
+def test_pairs_of_like_names_have_metrics_of_their_own(tmp_path: Path) -> None:
+    bases = {"a+": 1.0, "a!": 9.0, "b": 20.0}
+    rows = [f"{group},{seed},{base + seed}" for group, base in bases.items() for seed in range(5)]
+    (tmp_path / "s.csv").write_text("\n".join(["group,seed,score", *rows]))
+    VERB.run([f"paths.outputs={tmp_path}", "tracking=none", f"scores={tmp_path / 's.csv'}"])
+    (folder,) = tmp_path.glob("comparisons/*")
+    metrics = [record.values for record in RunFolder(folder).records() if isinstance(record, Metrics)]
+    assert len({abs(value) for key, value in metrics[0].items() if not key.endswith("/decided")}) == 3
 
 
 @pytest.mark.parametrize("word", ["by=seed", "runs=cnn", "where=seed=0", "at_epsilon=0.05", "score=training"])

@@ -1,5 +1,7 @@
 """The table of results."""
 
+import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -55,6 +57,21 @@ def test_a_run_that_is_made_longer_has_its_last_evaluation(
     report(tmp_path)
     (row,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("│"))
     assert row.replace("│", "").split()[1:4] == ["500", "(interrupted)", "7,777"]
+
+
+def test_a_score_that_is_no_number_is_left_blank(
+    recorded: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = recorded() / "result.json"
+    stored = json.loads(path.read_text())
+    stored["evaluation"]["evaluation/mean"] = math.nan
+    stored["counts"] = {"flops": 5.0}  # without updates
+    path.write_text(json.dumps(stored))
+    report(tmp_path)
+    (row,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("│"))
+    assert row.split("│")[3].strip() == ""
+    assert row.split("│")[4].strip()
+    assert RunFolder(path.parent).beyond({"budget.flops": 1.0}) is None
 
 
 def test_a_run_is_one_line_and_chosen_by_name_and_config(
