@@ -117,6 +117,12 @@ def of_every_run() -> Iterator[tuple[str, str]]:
             yield REPRODUCTION if question == "reproduction" else LAB, mean_and_iqm(games_at(run))
 
 
+def views_of(comparison: str) -> dict[str, dict[str, str]]:
+    """Return a kept comparison's views at equal frames, hours and FLOPs."""
+    with (RESULTS / "verdict/comparisons" / comparison / "artifacts/tables/views.csv").open() as file:
+        return {row["view"]: row for row in csv.DictReader(file)}
+
+
 def of_the_verdicts() -> Iterator[tuple[str, str]]:
     for looks in sorted((RESULTS / "verdict" / "comparisons").glob("*/looks.json")):
         for look in json.loads(looks.read_text()).popitem()[1]:
@@ -124,11 +130,10 @@ def of_the_verdicts() -> Iterator[tuple[str, str]]:
             yield from (
                 (LAB, text.lstrip("-")) for text in whole(verdict[key] for key in ("difference", "low", "high"))
             )
-    with next((RESULTS / "verdict/comparisons").glob("cnn-vs*")).joinpath("artifacts/tables/views.csv").open() as file:
-        for row in csv.DictReader(file):
-            if row["view"] != "equal hours":
-                values = whole(float(row[f"{key} (points)"]) for key in ("difference", "low", "high"))
-                yield from ((LAB, text) for text in values)
+    for view, row in views_of("cnn-vs-resnet-fast-e09e14bb20").items():
+        if view != "equal hours":
+            values = whole(float(row[f"{key} (points)"]) for key in ("difference", "low", "high"))
+            yield from ((LAB, text) for text in values)
     for model in ("cnn", "resnet_fast"):
         uniform, top = (
             {seed: interquartile_mean(games_at(run).scores) for seed, run in of_the_verdict(model, sampler).items()}
@@ -153,6 +158,19 @@ def of_the_training_score() -> Iterator[tuple[str, str]]:
         (verdict,) = decide(chosen, plan).verdicts
         assert verdict.said == "better"
         yield from ((ASKED, text) for text in whole((verdict.difference, verdict.low, verdict.high)))
+
+
+def of_equal_arithmetic() -> Iterator[tuple[str, str]]:
+    for run in of_the_verdict("resnet").values():
+        games = games_at(run)
+        chosen = games.counts[..., 0].sum(axis=0)
+        noop = f"{100 * chosen[games.actions.index('NOOP')] / chosen.sum():.0f} %"
+        yield LAB, f"| {games.steps.mean():,.0f} | {noop} | {mean_and_iqm(games)} |"
+        assert run.result is not None
+        yield from ((LAB, text) for text in whole((run.result.steps, run.result.counts["updates"])))
+    frames = views_of("cnn-vs-resnet-890faa26f7")["equal frames"]
+    columns = ("at", "leader_score (points)", "other_score (points)")
+    yield from ((LAB, text) for text in whole(float(frames[key]) for key in columns))
 
 
 def of_three_networks() -> Iterator[tuple[str, str]]:
@@ -285,6 +303,7 @@ SECTIONS = (
     of_every_run,
     of_the_verdicts,
     of_the_training_score,
+    of_equal_arithmetic,
     of_three_networks,
     of_the_fields_game,
     of_rewards,

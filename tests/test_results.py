@@ -180,6 +180,7 @@ def test_a_kept_curve_has_a_point_every_5000_steps_and_its_whole_end() -> None:
     ("question", "looks"),
     [
         ("by=model runs=decide-7cfff86226", ("01234", "56789")),
+        pytest.param("by=model runs=decide-4ec5bdb9f5", ("0123456789",), marks=pytest.mark.slow),
         pytest.param("by=sampler runs=decide-2e9cf34c18", ("0123456789",), marks=pytest.mark.slow),
         pytest.param("by=sampler runs=decide-c9c6a6ffea", ("0123456789",), marks=pytest.mark.slow),
     ],
