@@ -243,7 +243,8 @@ def condition(verdict: Verdict, look: Look, groups: Mapping[str, Mapping[int, fl
     floor = min(0.0, *map(min, values))
     best = max(float(np.mean(row)) for row in values) - floor
     undone_by = abs(verdict.difference) / best if best else 0.0
-    return Condition(large / small if small else np.inf, undone_by, 1 - 0.05 ** (1 / verdict.seeds))
+    spreads = large / small if small else np.inf if large else 1.0
+    return Condition(spreads, undone_by, 1 - 0.05 ** (1 / verdict.seeds))
 
 
 def size_found(verdict: Verdict, look: Look) -> float:

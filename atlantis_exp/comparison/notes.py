@@ -4,7 +4,7 @@ import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from math import isclose, nan
+from math import isclose, isfinite, nan
 from statistics import fmean, variance
 
 from atlantis_exp.comparison.account import seeds_between
@@ -102,11 +102,14 @@ def conditions(facts: Facts) -> Iterator[str]:
         if verdict.said in ("better", "worse"):
             one, other = verdict.leading.group, verdict.leading.other
             found = condition(verdict, look, answer.family.seeds)
+            here = f"{found.spreads:.1f} times as much in one group"
+            if not isfinite(found.spreads):
+                here = "those of one group do not vary"
             yield (
                 f"{one} against {other}: a look overstates the difference that it finds; the true one is rather "
                 f"{points(abs(size_found(verdict, look)))} points. The verdict assumes that seeds vary alike (here "
-                f"{found.spreads:.1f} times as much in one group). It would not hold if {found.undone_by:.0%} of the "
-                f"seeds of {one} collapsed; {verdict.seeds} seeds cannot exclude up to {found.unseen:.0%}."
+                f"{here}). It would not hold if {found.undone_by:.0%} of the seeds of {one} collapsed; "
+                f"{verdict.seeds} seeds cannot exclude up to {found.unseen:.0%}."
             )
 
 

@@ -749,6 +749,14 @@ def test_a_verdict_says_its_condition_and_its_size_where_a_look_found_it() -> No
     assert "would not hold if 5% of the seeds of a collapsed" in line
     assert re.search(r"1\.0 times as much .* cannot exclude up to (26|45)%", line)
     assert not [note for note in compared(around("a", 1_000) + around("b", 1_000)).caveats if "collapsed" in note]
+    steady, steadier = (
+        [of(name, seed, (score,) * 4) for seed in range(10)] for name, score in (("c", 5.0), ("d", 9.0))
+    )
+    for others, said in (
+        (around("a", 1_000, range(10)), "here those of one group do not vary"),
+        (steadier, "here 1.0"),
+    ):
+        assert any(said in note for note in compared([*steady, *others]).caveats)
 
 
 def test_under_the_verdict_stand_its_looks_its_error_and_the_length_of_training() -> None:
