@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from atlantis_exp.comparison.decision import Plan, decide, mean_interval
+from atlantis_exp.comparison.decision import Plan, decide, equivalence, mean_interval
 from atlantis_exp.comparison.estimands import score_of
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.components import game_of
@@ -158,6 +158,17 @@ def of_the_training_score() -> Iterator[tuple[str, str]]:
         (verdict,) = decide(chosen, plan).verdicts
         assert verdict.said == "better"
         yield from ((ASKED, text) for text in whole((verdict.difference, verdict.low, verdict.high)))
+
+
+def of_equivalence() -> Iterator[tuple[str, str]]:
+    for model in ("cnn", "resnet_fast"):
+        uniform, top = (
+            [*map(score_of, of_the_verdict(model, sampler).values())] for sampler in ("uniform", "top_half")
+        )
+        spread = np.sqrt(np.mean([np.var(scores, ddof=1) for scores in (uniform, top)]))
+        delta = 0.05 * float(np.mean(uniform))
+        seeds = next(n for n in itertools.count(5) if equivalence(Plan(looks=(n,), delta=delta), spread) <= delta)
+        yield LAB, f"at {seeds}"
 
 
 def of_equal_arithmetic() -> Iterator[tuple[str, str]]:
@@ -304,6 +315,7 @@ SECTIONS = (
     of_the_verdicts,
     of_the_training_score,
     of_equal_arithmetic,
+    of_equivalence,
     of_three_networks,
     of_the_fields_game,
     of_rewards,
