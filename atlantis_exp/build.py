@@ -131,10 +131,15 @@ def import_components(config: cfg.Config) -> None:
     for part in (*parts, *(config.sampler_of(phase) for phase in config.phase)):
         if part.component is None:
             raise ConfigError(needs(config))
-        cls = part.component.load()
-        if config.compile and part is config.model and hasattr(cls, "sequence"):
-            raise ConfigError(f"compile=true: model={part.name} has a memory; only others can be compiled")
+        part.component.load()
+    _refuse_to_compile_a_memory(config)
     _num_actions(config)
+
+
+def _refuse_to_compile_a_memory(config: cfg.Config) -> None:
+    component = config.model.component
+    if config.compile and component is not None and hasattr(component.load(), "sequence"):
+        raise ConfigError(f"compile=true: model={config.model.name} has a memory; only others can be compiled")
 
 
 def _check_output(config: cfg.Config, network: nn.Module) -> None:
@@ -220,7 +225,7 @@ def build_optimizer(optimizer: cfg.AdamConfig | cfg.RmsPropConfig, network: nn.M
 
 def build_learner(config: cfg.Config) -> Learner:
     """Return the learner: both networks, the optimizer and the objective."""
-    import_components(config)
+    _refuse_to_compile_a_memory(config)
     device, target = choose_device(config.device), config.objective.target
     network = build_network(config, "network", device)
     target_network = build_network(config, "target", device)

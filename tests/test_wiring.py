@@ -180,7 +180,7 @@ def test_a_training_that_will_not_fit_is_refused_before_it_begins_unless_a_warni
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=2**20))
-    shortage = r"memory will not suffice: \d+ MiB needed, 1 MiB available; lower replay.max_bytes or replay."
+    shortage = r"memory will not suffice: \d+ MiB needed, 1 MiB available; lower replay.max_bytes, replay."
     words = replaced(tiny_overrides, "evaluation.at_end=false", "budget.steps=20", f"paths.outputs={tmp_path}")
     assert command(*replaced(words, "budget.forecast=refuse")) == 1
     shown = capsys.readouterr()
