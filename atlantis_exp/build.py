@@ -155,11 +155,14 @@ def _check_output(config: cfg.Config, network: nn.Module) -> None:
         if made != shape:
             raise TypeError(f"{component.load().__name__} returns {made} for two states; should be {shape}")
         if hasattr(network, "sequence"):
-            _check_memory(network, env.state_shape, shape)
+            check_memory(network, env.state_shape, shape)
 
 
-def _check_memory(network: nn.Module, state: tuple[int, ...], shape: tuple[int, ...]) -> None:
-    """Raise TypeError unless a network has sizes, and values of two sequences as of two states."""
+def check_memory(network: nn.Module, state: tuple[int, ...], shape: tuple[int, ...]) -> None:
+    """Raise TypeError unless a network with a method `sequence` has sizes, and values of two sequences as of states.
+
+    shape: of its values of two states (2, C, H, W).
+    """
     for name in ("units", "burn_in", "unroll"):
         if not isinstance(count := getattr(network, name, None), int) or count < 1:
             raise TypeError(f"{name} is {count}; a network with a method sequence needs an int of at least 1")

@@ -12,11 +12,11 @@ one for the plain learner, too. `--rehearse` does everything without graphs, on 
 import argparse
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
+from unittest.mock import patch
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -24,7 +24,7 @@ import torch
 from atlantis_exp.build import build_learner, choose_device
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.learning.objectives import action_values
-from atlantis_exp.learning.values import generators_of
+from atlantis_exp.learning.values import channels_last, generators_of
 from atlantis_exp.sessions.processor import set_up_torch
 from benchmarks.composition import composed
 from benchmarks.contest import calls_per_second, print_results, print_table, take_turns
@@ -70,7 +70,7 @@ class Captured:
 
     def q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
         """Return the values (B, A) as `Learner.q_values`."""
-        learner, merged = self._learner, _merged(states)
+        learner, merged = self._learner, channels_last(states)
         if self._values is None:
             self._states = learner._sent(merged).clone()
             self._values = self._capture(learner, lambda: self._q(states))
@@ -97,18 +97,16 @@ class Captured:
     def _work(self, *batch: npt.NDArray[Any]) -> torch.Tensor:
         """Make an update of the buffers in place of the batch, without its moves."""
         learner = self._learner
-        updates, measured = learner.updates, learner._measured
-        moves = {name: lambda: None for name in ("_move_target", "_move_average")}
-        learner.updates = self._count  # type: ignore[assignment]
-        with _replaced(learner, _sent=self._buffers(self._batch, _sent_by_an_update(*batch)), **moves):
-            errors = learner.update(*batch)
-        learner.updates, learner._measured = updates, measured
-        return errors
+        replaced: dict[str, Any] = {name: lambda: None for name in ("_move_target", "_move_average")}
+        replaced |= {"updates": self._count, "_measured": learner._measured}
+        replaced["_sent"] = self._buffers(self._batch, _sent_by_an_update(*batch))
+        with patch.multiple(learner, **replaced):
+            return learner.update(*batch)
 
     @torch.no_grad()
     def _q(self, states: npt.NDArray[np.uint8]) -> torch.Tensor:
         learner = self._learner
-        with _replaced(learner, _sent=self._buffers([self._states], [_merged(states)])):
+        with patch.multiple(learner, _sent=self._buffers([self._states], [channels_last(states)])):
             return action_values(learner._online.networks[0](learner._input(states)).float())
 
     def _buffers(self, buffers: Sequence[torch.Tensor], arrays: Arrays) -> Callable[..., torch.Tensor]:
@@ -143,23 +141,7 @@ def graph_of(learner: Learner, work: Work) -> Work:
 def _sent_by_an_update(*batch: npt.NDArray[Any]) -> Arrays:
     """Return the arrays that an update sends to the device, in its order."""
     s_t, a_t, r_t, s_tpm, discount = batch
-    return a_t, r_t, _merged(s_tpm), discount, _merged(s_t), np.ones(len(s_t), np.float32)
-
-
-def _merged(states: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return states (B, C, H, W) with their channels last."""
-    batch, channels, height, width = states.shape
-    merged = cv2.merge([states[:, channel].reshape(-1, width) for channel in range(channels)])
-    return np.asarray(merged.reshape(batch, height, width, channels), np.uint8)
-
-
-@contextmanager
-def _replaced(learner: Learner, **members: Any) -> Iterator[None]:
-    """Give a learner other members for the length of the block."""
-    vars(learner).update(members)
-    yield
-    for name in members:
-        delattr(learner, name)
+    return a_t, r_t, channels_last(s_tpm), discount, channels_last(s_t), np.ones(len(s_t), np.float32)
 
 
 def learner_of(*overrides: str) -> tuple[Learner, Callable[[int], tuple[Any, ...]]]:
@@ -186,23 +168,17 @@ def are_equal(capture: Capture, *overrides: str, updates: int = 40) -> bool:
     other, _ = learner_of(*overrides)
     captured = Captured(other, capture)
     states = batch(updates)[0][:16]
-    for seed in range(updates):
-        for learner in (plain, other):
-            learner.optimizer.param_groups[0]["lr"].mul_(0.99)
-        if not torch.equal(plain.update(*batch(seed)), captured.update(*batch(seed))):
-            return False
-        if not np.array_equal(plain.q_values(states), captured.q_values(states)):
-            return False
-    return all(map(torch.equal, *(_tensors(each.state_dict()) for each in (plain, other))))
-
-
-def _tensors(node: Any) -> Iterator[torch.Tensor]:
-    """Yield the tensors of a learner's state."""
-    if isinstance(node, dict):
-        for value in node.values():
-            yield from _tensors(value)
-    elif isinstance(node, torch.Tensor):
-        yield node
+    same = partial(torch.testing.assert_close, rtol=0, atol=0)
+    try:
+        for seed in range(updates):
+            for learner in (plain, other):
+                learner.optimizer.param_groups[0]["lr"].mul_(0.99)
+            same(captured.update(*batch(seed)), plain.update(*batch(seed)))
+            same(captured.q_values(states), plain.q_values(states))
+        same(other.state_dict(), plain.state_dict())
+    except AssertionError:
+        return False
+    return True
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -100,6 +100,12 @@ def pace_of(games: EpisodeTable) -> tuple[float, ...]:
     return (*rates, games.points.sum(axis=0)[:-1].sum() / every, games.steps.mean(), games.scores.mean())
 
 
+def waiting(games: EpisodeTable) -> str:
+    """Format the share of NOOP in the network's decisions."""
+    chosen = games.counts[..., 0].sum(axis=0)
+    return f"{100 * chosen[games.actions.index('NOOP')] / chosen.sum():.0f} %"
+
+
 def side_share(games: EpisodeTable) -> float:
     """Return the percentage of bomber hits by side guns."""
     hits = hits_of(games)
@@ -174,9 +180,7 @@ def of_equivalence() -> Iterator[tuple[str, str]]:
 def of_equal_arithmetic() -> Iterator[tuple[str, str]]:
     for run in of_the_verdict("resnet").values():
         games = games_at(run)
-        chosen = games.counts[..., 0].sum(axis=0)
-        noop = f"{100 * chosen[games.actions.index('NOOP')] / chosen.sum():.0f} %"
-        yield LAB, f"| {games.steps.mean():,.0f} | {noop} | {mean_and_iqm(games)} |"
+        yield LAB, f"| {games.steps.mean():,.0f} | {waiting(games)} | {mean_and_iqm(games)} |"
         assert run.result is not None
         yield from ((LAB, text) for text in whole((run.result.steps, run.result.counts["updates"])))
     frames = views_of("cnn-vs-resnet-890faa26f7")["equal frames"]
@@ -197,8 +201,7 @@ def of_three_networks() -> Iterator[tuple[str, str]]:
             row = (seed, network, config.threads, f"{counts['hours']:.2f}", f"{teraflops[model]:,.0f}", f"{rate:.2f}")
             yield LAB, f"| {' | '.join(map(str, row))} | {games.steps.mean():,.0f} | {mean_and_iqm(games)} |"
             if model == "resnet" or (model, seed) == ("cnn", 0):
-                chosen = games.counts[..., 0].sum(axis=0)
-                yield LAB, f"{100 * chosen[games.actions.index('NOOP')] / chosen.sum():.0f} %"
+                yield LAB, waiting(games)
                 yield from ((LAB, text) for text in (f"{side:.0f} %", f"{hits:.1f}"))
     yield LAB, f"{teraflops['resnet'] / teraflops['cnn']:.1f} times"
     yield LAB, f"{flops / config.training.batch_size / 1e9:.2f} GFLOP"

@@ -71,9 +71,10 @@ def options_of(group: str) -> list[str]:
 def _of_group(name: str, option: str) -> Iterator[str]:
     """Yield a group with its options, then the keys of one of them."""
     folder, _, package = name.partition("@")
-    yield f"{name}={option}   ({', '.join(options_of(name))})"
-    path = CONF / folder / f"{option}.yaml"
-    if not package and option in options_of(name):
+    options = options_of(name)
+    yield f"{name}={option}   ({', '.join(options)})"
+    if not package and option in options:
+        path = CONF / folder / f"{option}.yaml"
         yield from _keys(path, "" if "@package _global_" in path.read_text("utf-8") else f"{folder}.")
 
 

@@ -80,17 +80,19 @@ def located(arguments: Sequence[str]) -> list[str]:
     ]
 
 
-def _from_file(name: str) -> Iterator[str]:
-    """Yield the overrides in a YAML file: for each key a value, a list of values, or Hydra's syntax for them."""
+def _from_file(name: str) -> list[str]:
+    """Return the overrides in a YAML file: for each key a value, a list of values, or Hydra's syntax for them."""
     try:
         tree = safe_load(read_file(absolute("sweep", name), SMALL))
-        leaves = {key: value if isinstance(value, list) else [value] for key, value in flatten(tree).items()}
-        texts = {key: [each if isinstance(each, str) else json.dumps(each) for each in leaves[key]] for key in leaves}
+        return [_override(key, value) for key, value in flatten(tree).items()]
     except (OSError, ValueError, TypeError, AttributeError, RecursionError, YAMLError) as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"sweep={name}: write KEY: VALUE or KEY: [VALUES] on each line ({reason})") from None
-    for key, values in texts.items():
-        yield f"{key}={','.join(values)}"
+
+
+def _override(key: str, value: object) -> str:
+    values = value if isinstance(value, list) else [value]
+    return f"{key}={','.join(each if isinstance(each, str) else json.dumps(each) for each in values)}"
 
 
 def _located(match: re.Match[str]) -> str:

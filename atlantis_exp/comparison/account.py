@@ -58,8 +58,7 @@ class Asked:
     def measure(self) -> tuple[object, ...]:
         """The score with its columns, and the difference that does not matter."""
         renamed = sorted((key, name) for key, name in self.columns.items() if key != name)
-        score = self.score, self.window, tuple(renamed)
-        return *score, self.delta, self.relative, self.relative and self.baseline
+        return self.score, renamed, self.window, self.delta, self.relative, self.relative and self.baseline
 
     @property
     def spent(self) -> float:

@@ -102,9 +102,8 @@ def conditions(facts: Facts) -> Iterator[str]:
         if verdict.said in ("better", "worse"):
             one, other = verdict.leading.group, verdict.leading.other
             found = condition(verdict, look, answer.family.seeds)
-            here = f"{found.spreads:.1f} times as much in one group"
-            if not isfinite(found.spreads):
-                here = "those of one group do not vary"
+            times = f"{found.spreads:.1f} times as much in one group"
+            here = times if isfinite(found.spreads) else "those of one group do not vary"
             yield (
                 f"{one} against {other}: a look overstates the difference that it finds; the true one is rather "
                 f"{points(abs(size_found(verdict, look)))} points. The verdict assumes that seeds vary alike (here "

@@ -42,6 +42,14 @@ class Recurrent(Protocol):
         ...
 
 
+def channels_last(states: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Return states (B, C, H, W) as (B, H, W, C)."""
+    batch, channels, height, width = states.shape
+    # OpenCV moves bytes: torch would take longer for it than a network's input takes otherwise.
+    bytes_BHWC = cv2.merge([states[:, channel].reshape(-1, width) for channel in range(channels)])
+    return bytes_BHWC.reshape(batch, height, width, channels)  # type: ignore[return-value]
+
+
 class Replicas:
     """Copies of a network, one a thread, that share buffers, generators and weights in the precision of the pass.
 
@@ -138,10 +146,7 @@ class ActionValues:
 
     def _input(self, states: npt.NDArray[np.uint8]) -> torch.Tensor:
         """Return states in [0, 1] in the precision of the forward pass, channels last."""
-        batch, channels, height, width = states.shape
-        # OpenCV moves the channels, as bytes: in torch this takes longer than the rest of the function.
-        bytes_BHWC = cv2.merge([states[:, channel].reshape(-1, width) for channel in range(channels)])
-        x_BHWC = self._sent(bytes_BHWC.reshape(batch, height, width, channels))
+        x_BHWC = self._sent(channels_last(states))
         return x_BHWC.to(self.dtype).div_(255).permute(0, 3, 1, 2)
 
     def _sent(self, array: npt.NDArray[Any]) -> torch.Tensor:

@@ -20,7 +20,7 @@ from rich.table import Table
 from torch import nn
 
 from atlantis_exp import documents, terminal
-from atlantis_exp.build import build_component, build_memory, import_components, make_emulator
+from atlantis_exp.build import build_component, build_memory, check_memory, import_components, make_emulator
 from atlantis_exp.config import ComponentConfig, Config
 from atlantis_exp.faults import Fault
 from atlantis_exp.learning.learner import Learner
@@ -194,8 +194,9 @@ def _splits(config: Config) -> None:
 
 def _remembers(config: Config) -> None:
     network = _made(config, config.env.size).eval()
-    if not isinstance(network, Recurrent):
-        raise TypeError("a network with a method sequence needs units, burn_in and unroll")
+    with torch.no_grad():
+        check_memory(network, config.env.state_shape, (2, _ACTIONS))
+    assert isinstance(network, Recurrent)
     x, nothing = _states(config, 6).unflatten(0, (2, 3)), torch.zeros(2, network.units)  # type: ignore[no-untyped-call]
     with torch.no_grad():
         whole, _ = network.sequence(x, nothing, torch.tensor([0, 1]))

@@ -79,7 +79,8 @@ def forecast(
     available = psutil.virtual_memory().available  # before the updates, which keep theirs
     # The states of a batch as bytes and float32, and what the first layer makes of them.
     sequences = 12 * plan.batch_size * sum(plan.window) * len(lags) * size**2 if plan.window else 0
-    measured = plan.batch_size if 2 * sequences <= available else max(1, plan.batch_size * available // sequences // 2)
+    share = min(1.0, available / 2 / sequences) if sequences else 1.0  # of a batch that is measured
+    measured = max(1, int(share * plan.batch_size))
     memory = ReplayMemory(8_192, (size, size), lags=lags, budget_bytes=8_192 * size * size)
     for env, observation in enumerate(emulators.reset(range(num_envs), [0] * num_envs)):
         memory.begin(env, observation)
