@@ -3,14 +3,17 @@
 A shipped network plays games by its card's protocol, or with `--oracle` a player that tries each action in a copy of
 the emulator, then waits there, and fires as soon as a shot pays. A replay of the games then looks at the screen before
 every decision: how often a ship, a vessel or a bomber, flies in each lane, and how often there is none. Ships appear in
-the top lane and come back a lane lower until they are hit. A gap leads from a hit to the next one.
+the top lane and come back a lane lower until they are hit. A gap leads from a hit to the next one. The frames from a
+ship to the next one of its wave are those that `python -m benchmarks.schedule` reckons with.
 """
 
 import argparse
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,8 +29,10 @@ from atlantis_exp.training.actor import PersonActor
 from atlantis_exp.training.progress import Progress
 from benchmarks.contest import print_results, print_table
 from benchmarks.evaluation import player
+from benchmarks.schedule import TICK
 
 PAID = {"centre_vessel": 100, "side_vessel": 200, "centre_bomber": 1_000, "side_bomber": 2_000}
+SHIPS_LEFT, BOMBERS_LEFT = 0x70, 0x75  # bytes of the console's memory
 _LANES = (19, 40, 61, 82)  # the first row of each
 _ROWS = 10  # of a ship
 _SHOTS = 5  # pixels; a shot is one, the smallest ship twelve
@@ -35,7 +40,15 @@ _AHEAD = 16  # steps that the oracle waits for a shot, which flies for about ten
 _SKIP = 4  # frames a step in its copy
 
 
-class Oracle(Emulator):
+class Watched(Emulator):
+    """An emulator that shows the ships and bombers that are still to come in the wave."""
+
+    def still_to_come(self) -> tuple[int, int]:
+        memory = self._ale.getRAM()
+        return int(memory[SHIPS_LEFT]), int(memory[BOMBERS_LEFT])
+
+
+class Oracle(Watched):
     """An emulator and a greedy player of it, who tries each action in a copy without sticky actions."""
 
     def __init__(self, **settings: Any) -> None:
@@ -69,6 +82,22 @@ def gaps(frames: Sequence[int], points: Sequence[Sequence[float]]) -> dict[str, 
     return {source: between[dearest == index].tolist() for index, source in enumerate(PAID)}
 
 
+def spacings(frames: Sequence[int], to_come: Sequence[tuple[int, int]]) -> dict[str, dict[int, int]]:
+    """Count the frames from each ship of a game to the next of its wave, by its kind.
+
+    Takes each step's frames, and the wave's ships and bombers still to come after it. Ships come at ticks, which a
+    step may pass by a few frames.
+    """
+    ticks, left = np.cumsum(frames) // TICK, np.array(to_come)
+    fewer = -np.diff(left, axis=0, prepend=left[:1])
+    found = {kind: Counter[int]() for kind in ("vessel", "bomber")}
+    (came,) = np.nonzero(fewer[:, 0] == 1)
+    for step, following in pairwise(came):
+        if left[following, 0] < left[step, 0]:
+            found["bomber" if fewer[step, 1] == 1 else "vessel"][TICK * int(ticks[following] - ticks[step])] += 1
+    return {kind: dict(sorted(each.items())) for kind, each in found.items()}
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the games in words and as a JSON line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.pace")
@@ -81,20 +110,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"about {args.games * args.steps / (900 if args.oracle else 9_000):.0f} minutes", file=sys.stderr, flush=True)
     actor, evaluator = player(args.weights, 1, args.steps)
     epsilon = evaluator.epsilon if args.epsilon is None else args.epsilon
-    emulator, emulators = evaluator.make_emulator(), None
+    settings = cast("partial[Emulator]", evaluator.make_emulator).keywords
+    emulator, emulators = Watched(**settings), None
     if args.oracle:
-        emulator = oracle = Oracle(**cast("partial[Emulator]", evaluator.make_emulator).keywords)
+        emulator = oracle = Oracle(**settings)
         actor, emulators = PersonActor(oracle.screen_rgb, oracle.choose), SerialEmulators(lambda: oracle, 1)
     played = replace(evaluator, epsilon=epsilon)(actor, args.games, Progress(Console(quiet=True)), emulators=emulators)
     seen, between = [], {source: list[int]() for source in PAID}
+    spaced = {kind: Counter[int]() for kind in ("vessel", "bomber")}
     for episode in played.episodes:
         emulator.reset(episode.seed)
-        steps = []
+        steps, to_come = [], []
         for action in episode.actions:
             seen.append(ships(emulator.screen_rgb()))
             steps.append(emulator.step(action))
+            to_come.append(emulator.still_to_come())
         for source, lengths in gaps([step.frames for step in steps], [step.points for step in steps]).items():
             between[source] += lengths
+        for kind, counts in spacings([step.frames for step in steps], to_come).items():
+            spaced[kind].update(counts)
     table = played.table()
     frames, points = table.frames.sum(), dict(zip(table.sources, table.points.sum(axis=0), strict=True))
     hits = sum(points[source] / paid for source, paid in PAID.items())
@@ -110,6 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "frames_to_the_next_hit": {
             source: np.percentile(each, (25, 50, 75)).tolist() for source, each in between.items() if each
         },
+        "frames_to_the_next_ship": {kind: dict(sorted(counts.items())) for kind, counts in spaced.items()},
     }
     who = "greedy look-ahead" if args.oracle else f"{args.weights} at epsilon {epsilon:g}"
     print(f"{who}: {table.steps.sum():,.0f} steps, {frames:,.0f} frames, a mean of {table.scores.mean():,.0f} points")
@@ -121,6 +156,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     quartiles = results["frames_to_the_next_hit"].items()
     rows = [(source, f"{results['hits'][source]:,.0f}", *(f"{each:,.0f}" for each in cut)) for source, cut in quartiles]
     print_table("frames from a hit to the next", ("", "hits", "a quarter below", "half", "three quarters"), rows)
+    for kind, counts in results["frames_to_the_next_ship"].items():
+        spread = ", ".join(f"{count:,} after {length}" for length, count in counts.items())
+        print(f"ships after a {kind} of their wave, by frames: {spread or 'none'}")
     print_results(results)
 
 

@@ -364,6 +364,12 @@ def test_a_gap_belongs_to_the_dearest_hit_of_the_step_before_it() -> None:
     assert pace.gaps([4, 4, 3, 4, 4], points) == hits
 
 
+def test_a_ship_comes_so_many_frames_after_one_of_its_wave() -> None:
+    ships_and_bombers = [(3, 1), (2, 0), (2, 0), (1, 0), (1, 0), (0, 0), (12, 2), (11, 2), (10, 1), (10, 1), (9, 1)]
+    frames = [24, 34, 30, 34, 40, 60, 300, 22, 64, 90, 6]
+    assert pace.spacings(frames, ships_and_bombers) == {"vessel": {64: 1, 96: 1}, "bomber": {64: 1, 96: 1}}
+
+
 def test_the_oracle_changes_nothing_by_looking_ahead_and_hits_more_than_chance(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
