@@ -4,7 +4,7 @@ A shipped network plays games by its card's protocol, or with `--oracle` a playe
 the emulator, then waits there, and fires as soon as a shot pays. A replay of the games then looks at the screen before
 every decision: how often a ship, a vessel or a bomber, flies in each lane, and how often there is none. Ships appear in
 the top lane and come back a lane lower until they are hit. A gap leads from a hit to the next one. The frames from a
-ship to the next one of its wave are those that `python -m benchmarks.schedule` reckons with.
+ship to the next one of its wave are those that `python -m benchmarks.schedule` chooses from.
 """
 
 import argparse

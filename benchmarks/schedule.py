@@ -4,8 +4,7 @@ A ship comes only at a tick, every 32 frames, and only if the top lane is empty.
 explode there takes less than a tick, so the next ship comes two ticks later, or three if the first is hit late in the
 lane. The bits of a shift register say which ship comes, a bomber one time in four. No action touches the register, and
 it begins alike in every game: the ships of all ticks are known beforehand, and a player chooses the ticks. The bounds
-assume that a side gun hits each ship and no building is lost. The loss of one ends the wave, and pays in the end: its
-bonus comes sooner, and 10,000 points restore the building.
+assume that a side gun hits each ship and no building is lost.
 """
 
 import argparse
