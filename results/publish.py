@@ -56,9 +56,9 @@ def in_the_fields_game() -> list[EpisodeTable]:
 
 
 def to_a_power(question: str) -> list[RunFolder]:
-    """Return the trainings in the field's game with rewards to a power, by seed."""
+    """Return the trainings in the field's game with rewards to a power and states of four frames, by seed."""
     configs = [(run, run.trained_config) for run in KEPT[question]]
-    there = [(run, each) for run, each in configs if each.env.id == "ALE/Atlantis-v5"]
+    there = [(run, each) for run, each in configs if (each.env.id, each.env.stack) == ("ALE/Atlantis-v5", 4)]
     return [run for run, each in sorted(there, key=lambda pair: pair[1].seed) if each.objective.reward_exponent < 1]
 
 
