@@ -60,7 +60,6 @@ def most_points(draws: npt.NDArray[np.bool_], gaps: Gaps) -> float:
                 here[0, 1:] += _BOMBER - _VESSEL
                 here[1:, 1:] = _BOMBER + np.maximum.reduce([points[tick + gap, :-1, :-1] for gap in gaps[True]])
         after[:ticks] = points[:ticks, -1, -1]
-        after[ticks:] = 0.0
     return float(after[0])
 
 

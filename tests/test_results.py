@@ -104,6 +104,9 @@ def test_the_notebook_has_what_the_greedy_look_ahead_reached() -> None:
     lanes = ", ".join(f"{100 * share:.0f} %" for share in kept["share_of_steps_in_lane"])
     empty = f"{100 * kept['share_of_steps_without_a_ship']:.0f} %"
     assert f"| greedy look-ahead | {' | '.join((*rates, lanes, empty))} |" in text_of(LAB)
+    (lower, median, upper), bomber = (kept["frames_to_the_next_hit"][f"side_{ship}"] for ship in ("vessel", "bomber"))
+    told = f"are {median:.0f} frames (median, quartiles {lower:.0f} and {upper:.0f}), from a bomber hit by one"
+    assert f"{told} {bomber[1]:.0f}." in text_of(LAB)
 
 
 def test_the_notebook_has_the_points_that_the_ships_allow() -> None:
