@@ -1,10 +1,10 @@
 """Bound the points that the ships of Atlantis allow: `python -m benchmarks.schedule`.
 
-A ship comes only at a tick, every 32 frames, and only if the top lane is empty. Neither to cross that lane nor to
-explode there takes less than a tick, so the next ship comes two ticks later, or three if the first is hit late in the
-lane. The bits of a shift register say which ship comes, a bomber one time in four. No action touches the register, and
-it begins alike in every game: the ships of all ticks are known beforehand, and a player chooses the ticks. The bounds
-assume that a side gun hits each ship and no building is lost.
+A ship comes only at a tick, every 32 frames, and only if the top lane is empty and no bomber explodes. To cross that
+lane takes more than a tick, so the next ship comes two ticks later, or three if the first still explodes then. The bits
+of a shift register say which ship comes, a bomber one time in four. No action touches the register, and it begins alike
+in every game: the ships of all ticks are known beforehand, and a player chooses the ticks. The bounds assume that a
+side gun hits each ship and no building is lost.
 """
 
 import argparse
@@ -26,7 +26,7 @@ Gaps = Mapping[bool, Sequence[int]]  # ticks that may lead from a ship to the ne
 PLAYERS: Mapping[str, Gaps] = {
     "each ship 64 frames after the last": {False: [2], True: [2]},
     "each 96 frames after a bomber, 64 after a vessel": {False: [2], True: [3]},
-    "foresight, 64 frames after a bomber, 64 or 96 after a vessel": {False: [2, 3], True: [2]},
+    "foresight, 64 or 96 frames after a bomber, 64 after a vessel": {False: [2], True: [2, 3]},
     "foresight, 64 or 96 frames after each": {False: [2, 3], True: [2, 3]},
 }
 

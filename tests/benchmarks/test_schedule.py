@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from ale_py import ALEInterface
 from ale_py.roms import get_rom_path
@@ -13,37 +14,49 @@ from benchmarks import schedule
 from benchmarks.pace import BOMBERS_LEFT, SHIPS_LEFT
 from benchmarks.schedule import FIRST_TICK, PLAYERS, TICK, Gaps, bombers, most_points
 
+FRAMES = 6_000
+TOP_LANE, STATE, BOMBER_EXPLODES = 0x27, 0x53, 0x5B  # bytes of the console's memory, empty at 0 and true above 127
+PLAYING = 1  # a wave, neither before it nor after
 
-def ships_of(seed: int, frames: int) -> list[tuple[int, bool, bool]]:
-    """Return when each ship comes in a game played at random, whether a bomber may, and whether it is one."""
+
+@cache
+def memory_of(seed: int) -> npt.NDArray[np.uint8]:
+    """Return the console's memory before and after each frame of a game played at random, (frames + 1, 128)."""
     ale = ALEInterface()
     ale.setFloat("repeat_action_probability", 0.25)
     ale.setInt("random_seed", seed)
     ale.loadROM(cast(Path, get_rom_path("atlantis")))
     ale.reset_game()
     actions, generator = ale.getMinimalActionSet(), np.random.default_rng(seed)
-    ships, before = [], ale.getRAM().copy()
-    for frame in range(frames):
+    memory = [ale.getRAM().copy()]
+    while len(memory) <= FRAMES and not ale.game_over():
         ale.act(actions[generator.integers(len(actions))])
-        if ale.game_over():
-            break
-        now = ale.getRAM().copy()
-        if int(before[SHIPS_LEFT]) - int(now[SHIPS_LEFT]) == 1:
-            ships.append((frame, bool(before[BOMBERS_LEFT]), bool(now[BOMBERS_LEFT] < before[BOMBERS_LEFT])))
-        before = now
-    return ships
+        memory.append(ale.getRAM().copy())
+    return np.array(memory)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_ships_come_at_ticks_and_as_the_register_says_in_every_game(seed: int) -> None:
-    ships = ships_of(seed, 6_000)
-    draws = bombers(6_000)
-    frames = [frame for frame, _, _ in ships]
-    assert len(ships) > 30
-    assert all(frame % TICK == FIRST_TICK for frame in frames)
+    memory = memory_of(seed).astype(int)
+    (frames,) = np.nonzero(np.diff(memory[:, SHIPS_LEFT]) == -1)
+    assert len(frames) > 30
+    assert np.all(frames % TICK == FIRST_TICK)
     assert np.diff(frames).min() >= 2 * TICK
-    assert [bomber for _, _, bomber in ships] == [may and bool(draws[frame // TICK]) for frame, may, _ in ships]
-    assert any(bomber for _, _, bomber in ships)
+    came = np.diff(memory[:, BOMBERS_LEFT])[frames] == -1
+    assert came.any()
+    assert came.tolist() == ((memory[frames, BOMBERS_LEFT] > 0) & bombers(FRAMES)[frames // TICK]).tolist()
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_ship_comes_at_each_tick_of_a_wave_with_an_empty_top_lane_and_no_exploding_bomber(seed: int) -> None:
+    memory = memory_of(seed).astype(int)
+    ticks = np.arange(FIRST_TICK, len(memory) - 1, TICK)
+    before, after = memory[ticks], memory[ticks + 1]
+    in_wave = (before[:, STATE] == PLAYING) & (before[:, SHIPS_LEFT] > 0)
+    came, exploding = after[:, SHIPS_LEFT] < before[:, SHIPS_LEFT], after[:, BOMBER_EXPLODES] > 127
+    assert (in_wave & exploding).any()
+    assert not (came & exploding).any()
+    assert came[in_wave & ~exploding & (before[:, TOP_LANE] == 0)].all()
 
 
 def played(draws: list[bool], gaps: Gaps) -> float:
