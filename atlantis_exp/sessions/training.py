@@ -150,6 +150,11 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
         with unforged(folder.checkpoints):
             done = Counters.of(state["counters"])
         progress.say(f"continuing run {folder.name} at step {done.steps:,}")
+    steps, plan = config.budget.steps, trainer.plan
+    if steps is not None and plan.unit == "steps" and steps < plan.length and (cut := _schedules_by_length(config)):
+        progress.say(
+            f"budget.steps={steps:,} ends at {steps / plan.length:.0%} of {cut}: set the phase's steps to finish it"
+        )
     if config.budget.forecast != "off":
         # Before there is anything to publish: importing MLflow meanwhile costs three quarters of the speed.
         _check_forecast(trainer, config, done, progress)
@@ -184,12 +189,16 @@ def _kin(job: Job, folder: RunFolder) -> str:
                 if config.plugins and {**theirs, "plugins": None} == {**science, "plugins": None}:
                     return f"; run {other.name} used {described(trained)}, this one uses {described(config)}"
                 if _any_length(theirs) == _any_length(science) and other.result is not None:
-                    parts = {"epsilon": config.epsilon, "lr_schedule": config.lr_schedule}
-                    follow = [f"{kind}={each.name}" for kind, each in parts.items() if each.name not in _FIXED]
-                    why = f" ({' and '.join(follow)} follow the length)" if follow else ""
+                    follow = _schedules_by_length(config)
+                    why = f" ({follow} follow the length)" if follow else ""
                     told = f"run {other.name}, of {other.result.steps:,} steps, has another plan{why}"
                     return f"; {told}: this one begins at step 0.\n{_begin_with(job, other)}"
     return ""
+
+
+def _schedules_by_length(config: Config) -> str:
+    parts = {"epsilon": config.epsilon, "lr_schedule": config.lr_schedule}
+    return " and ".join(f"{kind}={each.name}" for kind, each in parts.items() if each.name not in _FIXED)
 
 
 def _any_length(science: Mapping[str, Any]) -> dict[str, Any]:

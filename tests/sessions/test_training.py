@@ -145,6 +145,15 @@ def test_a_longer_plan_says_which_run_is_the_same_over_a_shorter_one_and_why_it_
     assert _kin(Job(tiny("seed=1")), RunFolder.of(tiny("seed=1"))) == ""
 
 
+def test_a_budget_that_cuts_a_schedule_says_so(tiny: Compose, capsys: pytest.CaptureFixture[str]) -> None:
+    fixed = ("epsilon=constant", "epsilon.value=0.1", "evaluation.at_end=false")
+    train(Job(tiny(*SHORT, "budget.steps=20", *fixed, "lr_schedule=linear")))
+    share = 20 / sum(phase.steps or 0 for phase in tiny(*SHORT).phase.values())
+    assert f"budget.steps=20 ends at {share:.0%} of lr_schedule=linear: set" in capsys.readouterr().out
+    train(Job(tiny(*SHORT, "budget.steps=20", *fixed)))
+    assert "ends at" not in capsys.readouterr().out
+
+
 def test_a_run_that_has_ended_is_reported_and_not_trained_again(
     tiny: Compose, capsys: pytest.CaptureFixture[str]
 ) -> None:
