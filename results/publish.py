@@ -245,8 +245,11 @@ def of_rewards() -> Iterator[tuple[str, str]]:
         yield LAB, row.replace("27,000 to 27,000", "27,000")
     runs = [run for run in to_a_power("rewards") if run.trained_config.objective.gamma == 0.99]
     (longer,) = [run for run in to_a_power("rewards") if run not in runs]
-    timed = EpisodeTable.read(RESULTS / "rewards" / "clock.csv", SOURCES).scores
-    yield from ((LAB, text) for text in whole((timed.mean(), timed.min(), timed.max())))
+    for path in sorted((RESULTS / "rewards").glob("clock_*.csv")):
+        scores = EpisodeTable.read(path, SOURCES).scores
+        whole_games = scores[scores > 500_000]
+        cells = whole((whole_games.mean(), whole_games.max(), scores.mean()))
+        yield LAB, " | ".join((f"| {len(whole_games)} of {len(scores)}", *cells))
     played = [games_at(run) for run in runs]
     means, scores = [games.scores.mean() for games in played], np.concatenate([games.scores for games in played])
     yield from ((LAB, text) for text in whole((*means, np.mean(means), np.ptp(means), min(scores), max(scores))))
