@@ -248,8 +248,8 @@ def of_rewards() -> Iterator[tuple[str, str]]:
     for path in sorted((RESULTS / "rewards").glob("clock_*.csv")):
         scores = EpisodeTable.read(path, SOURCES).scores
         whole_games = scores[scores > 500_000]
-        cells = whole((whole_games.mean(), whole_games.max(), scores.mean()))
-        yield LAB, " | ".join((f"| {len(whole_games)} of {len(scores)}", *cells))
+        points = whole((whole_games.mean(), whole_games.max(), scores.mean()))
+        yield LAB, " | ".join((f"| {len(whole_games)} of {len(scores)}", *points))
     played = [games_at(run) for run in runs]
     means, scores = [games.scores.mean() for games in played], np.concatenate([games.scores for games in played])
     yield from ((LAB, text) for text in whole((*means, np.mean(means), np.ptp(means), min(scores), max(scores))))
