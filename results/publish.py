@@ -246,10 +246,10 @@ def of_rewards() -> Iterator[tuple[str, str]]:
     runs = [run for run in to_a_power("rewards") if run.trained_config.objective.gamma == 0.99]
     (longer,) = [run for run in to_a_power("rewards") if run not in runs]
     for path in sorted((RESULTS / "rewards").glob("clock_*.csv")):
-        scores = EpisodeTable.read(path, SOURCES).scores
-        whole_games = scores[scores > 500_000]
-        points = whole((whole_games.mean(), whole_games.max(), scores.mean()))
-        yield LAB, " | ".join((f"| {len(whole_games)} of {len(scores)}", *points))
+        games = EpisodeTable.read(path, SOURCES)
+        capped = games.scores[games.truncated.astype(bool)]
+        points = whole((capped.mean(), capped.max(), games.scores.mean()))
+        yield LAB, " | ".join((f"| {len(capped)} of {len(games.scores)}", *points))
     played = [games_at(run) for run in runs]
     means, scores = [games.scores.mean() for games in played], np.concatenate([games.scores for games in played])
     yield from ((LAB, text) for text in whole((*means, np.mean(means), np.ptp(means), min(scores), max(scores))))

@@ -29,7 +29,7 @@ from atlantis_exp.sessions.stopping import StopRequest, sweep_goes_on
 from atlantis_exp.tracking.publishing import catch_up, publishing
 from atlantis_exp.training.checkpoint import unforged
 from atlantis_exp.training.forecast import Forecast, forecast
-from atlantis_exp.training.plan import Counters
+from atlantis_exp.training.plan import Counters, Plan
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Outcome, Trainer
 
@@ -150,11 +150,10 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
         with unforged(folder.checkpoints):
             done = Counters.of(state["counters"])
         progress.say(f"continuing run {folder.name} at step {done.steps:,}")
-    steps, plan = config.budget.steps, trainer.plan
-    if steps is not None and plan.unit == "steps" and steps < plan.length and (cut := _schedules_by_length(config)):
-        progress.say(
-            f"budget.steps={steps:,} ends at {steps / plan.length:.0%} of {cut}: set the phase's steps to finish it"
-        )
+    if (steps := config.budget.steps) is not None:
+        names = f"epsilon={config.epsilon.name}", f"lr_schedule={config.lr_schedule.name}"
+        if cut := _cut_by_budget(trainer.plan, steps, names):
+            progress.say(cut)
     if config.budget.forecast != "off":
         # Before there is anything to publish: importing MLflow meanwhile costs three quarters of the speed.
         _check_forecast(trainer, config, done, progress)
@@ -177,6 +176,19 @@ def _open(trainer: Trainer, job: Job, folder: RunFolder, journal: Journal, progr
     journal.status("RUNNING")
 
 
+def _cut_by_budget(plan: Plan, steps: int, names: tuple[str, str]) -> str:
+    """Return a hint at schedules that are not where they end when the budget ends; empty if there are none.
+
+    names: of the schedules of epsilon and of the learning rate.
+    """
+    if plan.unit == "episodes" or steps >= plan.length:
+        return ""
+    share, schedules = steps / plan.length, zip(names, (plan.epsilon, plan.learning_rate), strict=True)
+    cut = [name for name, value in schedules if value(share, steps) != value(1.0, plan.length)]
+    told = f"budget.steps={steps:,} ends at {share:.0%} of {' and '.join(cut)}: set the phase's steps to finish it"
+    return told if cut else ""
+
+
 def _kin(job: Job, folder: RunFolder) -> str:
     """Return a hint at a run that differs only in its plugins or its plan's length; empty if there is none."""
     config, science = job.config, job.config.science()
@@ -189,16 +201,12 @@ def _kin(job: Job, folder: RunFolder) -> str:
                 if config.plugins and {**theirs, "plugins": None} == {**science, "plugins": None}:
                     return f"; run {other.name} used {described(trained)}, this one uses {described(config)}"
                 if _any_length(theirs) == _any_length(science) and other.result is not None:
-                    follow = _schedules_by_length(config)
-                    why = f" ({follow} follow the length)" if follow else ""
+                    parts = {"epsilon": config.epsilon, "lr_schedule": config.lr_schedule}
+                    follow = [f"{kind}={each.name}" for kind, each in parts.items() if each.name not in _FIXED]
+                    why = f" ({' and '.join(follow)} follow the length)" if follow else ""
                     told = f"run {other.name}, of {other.result.steps:,} steps, has another plan{why}"
                     return f"; {told}: this one begins at step 0.\n{_begin_with(job, other)}"
     return ""
-
-
-def _schedules_by_length(config: Config) -> str:
-    parts = {"epsilon": config.epsilon, "lr_schedule": config.lr_schedule}
-    return " and ".join(f"{kind}={each.name}" for kind, each in parts.items() if each.name not in _FIXED)
 
 
 def _any_length(science: Mapping[str, Any]) -> dict[str, Any]:

@@ -151,6 +151,7 @@ def test_a_budget_that_cuts_a_schedule_says_so(tiny: Compose, capsys: pytest.Cap
     share = 20 / sum(phase.steps or 0 for phase in tiny(*SHORT).phase.values())
     assert f"budget.steps=20 ends at {share:.0%} of lr_schedule=linear: set" in capsys.readouterr().out
     train(Job(tiny(*SHORT, "budget.steps=20", *fixed)))
+    train(Job(tiny(*SHORT, "budget.steps=20", "epsilon=linear")))  # over after a tenth of the plan
     assert "ends at" not in capsys.readouterr().out
 
 
