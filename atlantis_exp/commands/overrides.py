@@ -253,7 +253,7 @@ def combined(choices: Sequence[Sequence[str]]) -> Iterator[tuple[str, ...]]:
 
 
 def values_of(override: Override) -> list[str]:
-    """Return the values that an override lists. Raises: ConfigError for none or too many."""
+    """Return the values that an override lists, of a glob our options. Raises: ConfigError for none or too many."""
     if isinstance(listed := override.value(), RangeSweep) and is_longer(listed, _MOST_JOBS):
         raise ConfigError(f"{override.input_line}: more than {_MOST_JOBS:,} values")
     try:
@@ -262,10 +262,10 @@ def values_of(override: Override) -> list[str]:
         reason = str(error).partition("\n")[0]
         raise ConfigError(f"{override.input_line}: {reason}") from None
     except HydraException:
-        text = override.input_line
-        if isinstance(listed, Glob) and (names := listed.filter(options_of(override.key_or_group))):
-            raise ConfigError(f"{text}: list the options, as in {override.key_or_group}={','.join(names)}") from None
-        raise ConfigError(f"{text}: not a list of values; write them out, or let `search` draw them") from None
+        values = listed.filter(options_of(override.key_or_group)) if isinstance(listed, Glob) else []
+        if not values:
+            reason = "not a list of values; write them out, or let `search` draw them"
+            raise ConfigError(f"{override.input_line}: {reason}") from None
     if not values:
         raise ConfigError(f"{override.input_line}: has no values")
     return values

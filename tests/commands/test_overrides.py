@@ -227,16 +227,21 @@ def test_a_plugin_of_an_unknown_user_is_one_line_before_hydra_reads_it() -> None
         located(["plugins=~nobodyhere/mynet.py"])
 
 
+def test_a_glob_sweeps_over_the_options_that_it_matches() -> None:
+    jobs = check("config", Config, ["-m", "model=glob(resnet*)", "sampler=glob(*,exclude=prio*)", "seed=3"])
+    assert [*jobs] == [
+        (f"model={model}", f"sampler={sampler}", "seed=3")
+        for model in ("resnet", "resnet_fast")
+        for sampler in ("top_half", "uniform")
+    ]
+
+
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
         ("seed=range(0)", "seed=range(0): has no values"),
         ("optimizer.lr=interval(0,1)", "optimizer.lr=interval(0,1): not a list of values; write them out"),
-        (
-            "model=glob(*)",
-            "model=glob(*): list the options, as in model=cnn,cnn_gru,cnn_small,resnet,resnet_fast",
-        ),
-        ("model=glob(resnet*)", "model=glob(resnet*): list the options, as in model=resnet,resnet_fast"),
+        ("model=glob(resnt*)", "model=glob(resnt*): not a list of values; write them out"),
         ("seed=glob(*)", "seed=glob(*): not a list of values; write them out"),
         ("seed=1,range(0,3)", "seed=1,range(0,3): Unexpected type annotation"),
         ("seed=range(0,1,0)", "seed=range(0,1,0): range() arg 3 must not be zero"),
