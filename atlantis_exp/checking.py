@@ -23,7 +23,7 @@ def nearest(word: str, choices: Iterable[str]) -> str:
     """Return the end of an error line: the closest of `choices`, and all if there are at most 12."""
     choices = sorted(choices)
     close = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
-    listed = f" (valid: {', '.join(choices)})" if len(choices) <= 12 else ""
+    listed = f" (valid: {', '.join(choices)})" if 0 < len(choices) <= 12 else ""
     return (f"did you mean '{close[0]}'?" if close else "no valid choice is near") + listed
 
 

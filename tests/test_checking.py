@@ -13,6 +13,7 @@ from atlantis_exp.faults import ConfigError
 def test_the_nearest_choice_is_named_and_few_choices_are_listed() -> None:
     assert nearest("resnt", ["cnn", "resnet"]) == "did you mean 'resnet'? (valid: cnn, resnet)"
     assert nearest("zzz", ["cnn", "resnet"]) == "no valid choice is near (valid: cnn, resnet)"
+    assert nearest("zzz", []) == "no valid choice is near"
     assert nearest("key7", [f"key{number}" for number in range(13)]) == "did you mean 'key7'?"
 
 

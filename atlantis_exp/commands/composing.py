@@ -69,11 +69,11 @@ def _folder(key: str, text: str) -> Path:
 def pinned(weights: str) -> str:
     """Return a folder of exported weights as FOLDER@DIGEST. Raises: ConfigError, also if a typed digest is wrong."""
     folder, digits = weights.rpartition("@")[::2] if re.match(PINNED, weights) else (weights, "")
-    path = Path(folder) / "weights.safetensors"
+    path = absolute("training.weights", folder) / "weights.safetensors"
     try:
         found = hashlib.sha256(read_file(path.resolve(), ARTIFACT)).hexdigest()[:16]
     except (OSError, ValueError):
-        others = [str(other.parent) for other in Path(folder).parent.glob("*/weights.safetensors")]
+        others = [str(other.parent) for other in path.parent.parent.glob("*/weights.safetensors")]
         hint = nearest(folder, others)
         raise ConfigError(f"training.weights={folder}: not a folder of exported weights; {hint}") from None
     if digits not in ("", found):

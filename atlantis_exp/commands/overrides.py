@@ -18,7 +18,7 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, IntervalSweep, Override, RangeSweep
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 from yaml import YAMLError, safe_load
 
@@ -174,7 +174,7 @@ def launcher(arguments: Sequence[str]) -> Launcher:
         if override.is_delete() or not (is_choice or key.startswith("hydra.launcher.")):
             raise ConfigError(f"{text}: of Hydra's keys, set only hydra/launcher=NAME and hydra.launcher.KEY=VALUE")
         if not flags.multirun:
-            raise ConfigError(f"{text}: applies to a sweep; add -m or drop it")
+            raise ConfigError(f"{text}: applies to a sweep of trainings (-m) and to decide; drop it")
         if is_choice:
             name = str(override.value())
     names = ["basic", *(path.stem for path in _LAUNCHERS.glob("*.yaml"))]
@@ -188,12 +188,17 @@ def launcher(arguments: Sequence[str]) -> Launcher:
     assert isinstance(settings, DictConfig)
     for override in overrides:
         if "/" not in override.key_or_group:
+            if name == "basic":
+                raise ConfigError(f"{override.input_line}: sets up a launcher; add hydra/launcher=joblib or slurm")
             _set_up(settings, override)
     if name == "basic":
         return BASIC
     if settings.get("n_jobs") == 0:
         raise ConfigError("hydra.launcher.n_jobs=0: write the number of jobs at a time, or -1 for one per core")
     return Launcher(name, OmegaConf.to_container(settings))  # type: ignore[arg-type]
+
+
+_KINDS = {int: "a number", bool: "true or false", str: "text", DictConfig: "a mapping", ListConfig: "a list"}
 
 
 def _set_up(settings: DictConfig, override: Override) -> None:
@@ -204,9 +209,9 @@ def _set_up(settings: DictConfig, override: Override) -> None:
         known = [f"hydra.launcher.{each!s}" for each in settings]
         raise ConfigError(f"{override.input_line}: no such key; {nearest(f'hydra.launcher.{first}', known)}")
     before = settings[first]
-    if isinstance(before, int | str) and type(value) is not type(before):
-        kind = "a number" if isinstance(before, int) else "text"
-        raise ConfigError(f"{override.input_line}: should be {kind}, as {before}")
+    given = type(before) if below else type(OmegaConf.create({"value": value}).value)
+    if before is not None and (given is not type(before) or (below and given is not DictConfig)):
+        raise ConfigError(f"{override.input_line}: should be {_KINDS[type(before)]}, as {before}")
     OmegaConf.update(settings, key, value, force_add=bool(below))
 
 
@@ -278,9 +283,11 @@ def with_first_values(arguments: Sequence[str]) -> list[str]:
     def first(text: str) -> object:
         override = read_override(text)
         value = override.value()
-        return value.start if isinstance(value, IntervalSweep) else values_of(override)[0]
+        if isinstance(value, IntervalSweep) or (isinstance(value, RangeSweep) and is_longer(value, _MOST_JOBS)):
+            return value.start
+        return values_of(override)[0]
 
-    return [f"{text.split('=', 1)[0]}={first(text)}" if text.lstrip("+") in several else text for text in arguments]
+    return [f"{text.split('=', 1)[0]}={first(text)}" if text in several else text for text in arguments]
 
 
 def is_longer(values: RangeSweep, most: int) -> bool:

@@ -81,8 +81,8 @@ def search_of(asked: Asked[SearchConfig]) -> "Search":
     if not texts:
         raise ConfigError("nothing to search: give a key several values, as in optimizer=adam,rmsprop")
     keys = {key_of(text) for text in searched}
-    fixed = [text for text in asked.overrides if key_of(text) not in keys]
-    own = [text for text in fixed if text.lstrip("+~").split("=")[0].split(".")[0] in _OWN]
+    fixed = [text for text in asked.overrides if text.startswith("--") or key_of(text) not in keys]
+    own = [text for text in fixed if text.lstrip("~").split("=")[0].split(".")[0] in _OWN]
     overrides = replaced([text for text in fixed if text not in own], f"seed={config.seed}")
     space = read_space(texts, CLOSED)
     return Search(

@@ -8,8 +8,9 @@ from atlantis_exp.commands.app import Asked, Verb
 from atlantis_exp.commands.jobs import job_of
 from atlantis_exp.commands.overrides import flags_of, key_of, swept
 from atlantis_exp.config import Config
-from atlantis_exp.sessions.job import command_line
-from atlantis_exp.sessions.launchers import Launcher
+from atlantis_exp.faults import ConfigError
+from atlantis_exp.sessions.job import Job, command_line
+from atlantis_exp.sessions.launchers import BASIC, Launcher
 
 
 def _work(asked: Asked[Config]) -> Callable[[], object]:
@@ -25,10 +26,14 @@ def _sweep(asked: Sequence[Asked[Config]], launcher: Launcher, arguments: Sequen
     from atlantis_exp.sessions.launchers.joblib import fitting
     from atlantis_exp.sessions.sweep import say_hours, sweep
 
-    jobs = [job_of(each) for each in asked]
+    jobs, first = [job_of(each) for each in asked], dict[str, Job]()
+    twins = [job for job in jobs if first.setdefault(job.config.run_name(), job) is not job]
     if not any(key_of(text) == "hydra/launcher" for text in flags_of(arguments).overrides):
-        launcher = fitting(jobs, len(jobs))
+        launcher = BASIC if twins else fitting(jobs, len(jobs))
         say_hours(jobs, launcher)
+    elif twins and not launcher.is_basic:
+        same, other = (" ".join(job.overrides) for job in (twins[0], first[twins[0].config.run_name()]))
+        raise ConfigError(f"{same}: makes the same run as {other}; continue it in turn, with hydra/launcher=basic")
     sweep(jobs, launcher, swept(arguments), command_line(*arguments), train_on_a_node)
 
 

@@ -176,6 +176,7 @@ class Journal(Tracker):
         self._folder = folder
         self._time = _now()  # ms, of the latest metrics
         self._offset = 0  # durable bytes of the state
+        self._noted: str | None = None
         self._lines: list[bytes] = []  # since the last checkpoint: a resumed run repeats them, so memory suffices
         commit = read_commit(folder) or _new_commit()
         if commit.status == "SCHEDULED":
@@ -208,7 +209,10 @@ class Journal(Tracker):
         self._append(Tags(_named(values)))
 
     def note(self, markdown: str) -> None:
-        self.tags({NOTE: markdown})
+        """Append a note, unless it is the last one that this process appended."""
+        if markdown != self._noted:
+            self.tags({NOTE: markdown})
+            self._noted = markdown
 
     def artifact(self, path: str, content: bytes) -> None:
         self._append(Artifact(path, self._write(path, content)))
@@ -260,7 +264,7 @@ class Journal(Tracker):
         except ValueError as error:
             advice = "restore it, or start over with resume=never, which keeps the old run"
             raise JournalError(f"{error}; {advice}") from None
-        self._offset, self._time = state["offset"], state["time"]
+        self._offset, self._time, self._noted = state["offset"], state["time"], None
         self._lines.clear()
 
     def _write(self, path: str, content: bytes) -> str:

@@ -158,7 +158,8 @@ class Contest:
         """Return the training of a contender with a seed."""
         job = self.contenders[label]
         overrides = (*job.overrides, f"seed={seed}")
-        if any("${" in text for text in overrides):  # compose anew, since a value may follow from the seed
+        # A value may follow from the seed, here or in a file of the user's: compose anew.
+        if any("${" in text or text.startswith(("--config-dir=", "plugins=")) for text in overrides):
             return self._job_of(overrides)
         return replace(job, config=replace(job.config, seed=seed), overrides=overrides)
 

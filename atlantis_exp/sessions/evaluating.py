@@ -11,7 +11,7 @@ from typing import Any
 
 from atlantis_exp import terminal
 from atlantis_exp.build import build_baseline, build_evaluator, build_network_actor, build_person
-from atlantis_exp.checking import digest, flatten, to_dict
+from atlantis_exp.checking import absolute, digest, flatten, to_dict
 from atlantis_exp.components import facts_of
 from atlantis_exp.config import (
     BaselineAgentConfig,
@@ -67,9 +67,9 @@ def evaluate(
     else:
         if "run" in asked:
             raise ConfigError(f"run={run}: weights={weights} names exported weights; drop one of the two")
-        card, stored = read_card(Path(weights))
+        card, stored = read_card(absolute("weights", weights))
         trained, step = card.config, card.step
-        name = title = Path(weights).resolve().name
+        name = title = absolute("weights", weights).resolve().name
         source = {"weights": name, "sha256": card.sha256}
         protocol: dict[str, Any] = {
             key: getattr(card.evaluation, key)

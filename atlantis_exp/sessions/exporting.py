@@ -9,9 +9,9 @@ from typing import Literal
 
 from atlantis_exp import terminal
 from atlantis_exp.build import build_evaluator
-from atlantis_exp.checking import check_new
+from atlantis_exp.checking import absolute, check_new
 from atlantis_exp.config import EvaluationConfig, PathsConfig
-from atlantis_exp.faults import Fault
+from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.files import whole
 from atlantis_exp.runs.folder import RunFolder, find_run
 from atlantis_exp.runs.journal import Metrics, Tags
@@ -42,7 +42,10 @@ def export(
     outputs = Path(paths.outputs)
     catch_up(outputs)
     source = find_run(outputs, run)
-    folder = Path(to or f"pretrained/{source.name}")
+    typed = Path(to or f"pretrained/{source.name}")
+    folder = absolute("to", str(typed))
+    if folder == Path.cwd():  # the export takes its place, and a shell would be left in none
+        raise ConfigError(f"to={to}: the folder that you are in; name another")
     check_new("to", folder)
     trained = portable(source.trained_config)
     stored, step = stored_weights(source, weights)
@@ -72,7 +75,7 @@ def export(
                 evaluation=settings,
                 scores=[episode.score for episode in played.episodes],
             )
-            write_card(place, folder, card, packed, played, exported and exported.content)
+            write_card(place, typed, card, packed, played, exported and exported.content)
     except OSError as error:
         raise Fault(f"to={folder}: {error}; nothing is written; make room there, or name another folder") from error
     print(f"\n{played.report()}\n\n{len(packed):,} bytes in {precision}, with card and scores, in {folder}")

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from atlantis_exp import terminal
 from atlantis_exp.build import build_trained_network, build_trainer, choose_device, described, import_components
-from atlantis_exp.checking import flatten, to_dict
+from atlantis_exp.checking import absolute, flatten, to_dict
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault, RunFault, in_words
 from atlantis_exp.runs.files import write_file
@@ -49,7 +49,7 @@ def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int |
     if folder.status != "SCHEDULED":  # else a sweep has begun it and records its failure
         choose_device(config.device)  # before anything is put aside or written
         import_components(config)
-        if not folder.has_started:
+        if not folder.has_started or config.resume == "never":
             _initial_weights(config)
     if _has_ended(job, folder):
         return None
@@ -125,7 +125,7 @@ def _initial_weights(config: Config) -> Mapping[str, torch.Tensor] | None:
     if config.training.pinned is None:
         return None
     folder, digits = config.training.pinned
-    card, content = read_card(Path(folder))
+    card, content = read_card(absolute("training.weights", folder))
     if not card.sha256.startswith(digits):
         raise ConfigError(f"training.weights={config.training.weights}: its weights are @{card.sha256[:16]}")
     try:

@@ -92,6 +92,32 @@ def test_contenders_may_share_a_key_that_the_default_option_lacks(words: tuple[s
     assert other.overrides[0] == words[1]
 
 
+def test_a_value_that_follows_from_the_seed_in_a_file_of_the_users_does_so_for_each_seed(tmp_path: Path) -> None:
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text('# @package _global_\nevaluation: {seed: "${seed}"}\n')
+    words = [f"--config-dir={tmp_path}", "experiment=mine", "model=cnn,resnet"]
+    (asked,) = decide.VERB.asked(decide.VERB.rewrite([*words]), words)
+    contest = decide.contest_of(asked)
+    assert [contest.job("cnn", seed).config.evaluation.seed for seed in (0, 3)] == [0, 3]
+
+
+def test_a_search_composes_from_a_folder_of_the_users(tmp_path: Path) -> None:
+    pytest.importorskip("optuna", reason="needs pip install 'atlantis-exp[search]'")
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text("# @package _global_\ntraining: {batch_size: 17}\n")
+    words = [
+        f"--config-dir={tmp_path}",
+        "experiment=mine",
+        "optimizer=adam,rmsprop",
+        "training.learn_start=range(1,19999)",
+    ]
+    (asked,) = search.VERB.asked(search.VERB.rewrite(list(words)), words)
+    found = search.search_of(asked)
+    assert found.corner.config.training.batch_size == 17
+    assert found.job_of([*found.overrides, "optimizer=rmsprop"]).config.training.batch_size == 17
+    assert {*found.space} == {"optimizer", "training.learn_start"}
+
+
 def test_a_search_may_set_a_key_that_all_searched_options_have() -> None:
     pytest.importorskip("optuna", reason="needs pip install 'atlantis-exp[search]'")
     words = [

@@ -95,6 +95,20 @@ def test_what_is_committed_is_read_back_in_its_order(tmp_path: Path, clock: Call
     ]
 
 
+def test_a_note_that_is_the_last_one_again_is_not_written_again(tmp_path: Path) -> None:
+    journal = Journal(tmp_path)
+    for text in ("one", "one", "two", "one"):
+        journal.note(text)
+    state = journal.state_dict()
+    journal.note("three")
+    journal.load_state_dict(state)
+    journal.note("three")
+    journal.flush()
+    assert [value for record in records(tmp_path) for value in vars(record)["values"].values()] == [
+        *("one", "two", "one", "three")
+    ]
+
+
 @settings(max_examples=30)
 @given(st.dictionaries(st.from_regex(r"[a-z]{1,9}", fullmatch=True), st.floats(), min_size=1))
 def test_every_float_survives_the_journal(values: dict[str, float]) -> None:

@@ -49,6 +49,19 @@ def exported(command: Command, trained: Path, tmp_path: Path) -> Path:
     return folder
 
 
+def test_an_exports_folder_is_typed_as_in_a_shell_and_is_not_the_one_that_it_is_in(
+    command: Command, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    shared = (f"paths.outputs={trained}", "device=cpu", "episodes=1")
+    assert command("export", "to=.", *shared) == 2
+    assert capsys.readouterr().err == "atlantis_exp: to=.: the folder that you are in; name another\n"
+    assert command("export", "to='~/here'", *shared) == 0
+    assert (tmp_path / "here" / "card.json").exists()
+    assert command("evaluate", "weights='~/here'", *shared, "tracking=none") == 0
+
+
 @pytest.mark.slow
 def test_a_training_begins_with_exported_weights_also_where_it_was_killed_before_its_first_commit(
     tiny: Compose, exported: Path, tmp_path: Path

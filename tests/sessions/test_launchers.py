@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import os
+import re
 import signal
 import sqlite3
 import subprocess
@@ -13,16 +14,18 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from atlantis_exp.commands.overrides import check, launcher
+from atlantis_exp.commands import CONF
+from atlantis_exp.commands.overrides import _set_up, check, launcher, read_override
 from atlantis_exp.config import Config, PathsConfig
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal, read_commit
 from atlantis_exp.sessions.contracts import fingerprints
 from atlantis_exp.sessions.job import Job, replaced
-from atlantis_exp.sessions.launchers import BASIC, Launcher
+from atlantis_exp.sessions.launchers import BASIC, Launcher, in_turn
 from atlantis_exp.sessions.launchers.joblib import fitted, fitting, shared, train_side_by_side
 from atlantis_exp.sessions.live import LiveTable
 from atlantis_exp.sessions.training import train
@@ -107,8 +110,66 @@ def test_the_launcher_of_a_command_line_is_known_and_a_wrong_setting_is_one_line
         launcher(["-m", "seed=0,1", "hydra/launcher=joblib", "hydra.launcher.n_jobs=many"])
     with pytest.raises(ConfigError, match=r"n_jbos=3: no such key; did you mean 'hydra.launcher.n_jobs'"):
         check("config", Config, ["-m", "seed=0,1", "hydra/launcher=joblib", "hydra.launcher.n_jbos=3"])
+    with pytest.raises(ConfigError, match=r"^hydra.launcher.n_jobs=2: sets up a launcher; add hydra/launcher=joblib"):
+        launcher(["-m", "seed=0,1", "hydra.launcher.n_jobs=2"])
     with pytest.raises(ConfigError, match=r"_target_=os.system: no such key"):  # which would be run
         check("config", Config, ["-m", "seed=0,1", "hydra/launcher=joblib", "hydra.launcher._target_=os.system"])
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        ("hydra.launcher.setup='module load cuda'", "a list"),
+        ("hydra.launcher.additional_parameters=requeue", "a mapping"),
+        ("hydra.launcher.stderr_to_stdout=3", "true or false"),
+        ("hydra.launcher.name.first=x", "text"),
+    ],
+)
+def test_a_setting_of_slurm_has_the_kind_of_its_default(text: str, kind: str) -> None:
+    settings = OmegaConf.load(CONF / "hydra" / "launcher" / "slurm.yaml")
+    assert isinstance(settings, DictConfig)
+    with pytest.raises(ConfigError, match=f"^{re.escape(text)}: should be {kind}, as "):
+        _set_up(settings, read_override(text))
+    for fitting_one in ("setup=[x]", "additional_parameters={}", "additional_parameters.exclusive=true", "gres=gpu:1"):
+        _set_up(settings, read_override(f"hydra.launcher.{fitting_one}"))
+    assert settings.setup == ["x"]
+    assert settings.additional_parameters == {"requeue": True, "exclusive": True}
+
+
+def test_jobs_in_turn_print_every_error_and_raise_the_first(capsys: pytest.CaptureFixture[str]) -> None:
+    def work(job: int) -> int | None:
+        if job < 3:
+            raise Fault(f"job {job} fails")
+        return None if job == 3 else signal.SIGTERM
+
+    with pytest.raises(Fault, match="job 1 fails"):
+        in_turn(work, [1, 2, 3])
+    assert capsys.readouterr().err == "atlantis_exp: job 2 fails\n"
+    with pytest.raises(SystemExit, match="143"):
+        in_turn(work, [1, 4])
+    assert capsys.readouterr().err == "atlantis_exp: job 1 fails\n"
+
+
+def test_jobs_of_one_run_are_never_trained_side_by_side(
+    command: Callable[..., int],
+    tiny_overrides: tuple[str, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = [*replaced(tiny_overrides, f"paths.outputs={tmp_path / 'o'}", "budget.forecast=off"), "budget.steps=80,160"]
+    assert command("-m", *words, "hydra/launcher=joblib") == 2
+    last = "budget.steps={}"
+    error = capsys.readouterr().err
+    assert f"{last.format(160)}: makes the same run as " in error
+    assert error.endswith(f"{last.format(80)}; continue it in turn, with hydra/launcher=basic\n")
+    assert not (tmp_path / "o").exists()
+    launchers: list[Launcher] = []
+    monkeypatch.setattr("atlantis_exp.sessions.sweep.sweep", lambda _, chosen, *__: launchers.append(chosen))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
+    assert command("-m", *words) == 0
+    assert command("-m", *words, "hydra/launcher=basic") == 0
+    assert launchers == [BASIC, BASIC]
 
 
 @pytest.mark.parametrize(
@@ -146,7 +207,9 @@ def test_as_many_trainings_go_on_at_a_time_as_the_machine_runs_well(
 ) -> None:
     planned, there, own, gigabytes, on_gpu = machine
     words = ("threads=null", *words) if not any(word.startswith("threads") for word in words) else words
-    assert fitted([tiny(*words)], planned, there, own, gigabytes * 2**30, on_gpu) == (at_once, cores)
+    memory = gigabytes * 2**30
+    assert fitted([tiny(*words)], planned, there, own, memory, memory, on_gpu) == (at_once, cores)
+    assert fitted([tiny(*words)], planned, there, own, memory, 2**30, on_gpu) == (1, cores)  # beside another program
 
 
 def test_a_training_has_as_many_cores_when_it_goes_on_after_others_have_ended(
@@ -247,6 +310,21 @@ def test_a_damaged_journal_leaves_the_other_runs_in_the_table(tiny: Compose) -> 
     shown = io.StringIO()
     LiveTable(jobs, folders, Console(file=shown, width=200)).look()
     assert "40 of 160 steps" in shown.getvalue()
+
+
+def test_a_job_may_print_bytes_that_are_no_text_and_its_last_line_says_why_it_failed(
+    tiny: Compose, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Prints(FakeProcess):
+        def __init__(self, *_: object, stdout: io.TextIOWrapper, **__: object) -> None:
+            os.write(stdout.fileno(), b"\xff\n" * 6_000 + b"atlantis_exp: no room \xff\n")
+
+    monkeypatch.setattr(subprocess, "Popen", Prints)
+    job, alone = Job(tiny()), Launcher("joblib", {"n_jobs": 1})
+    train_side_by_side([job], alone)
+    monkeypatch.setattr(Prints, "code", 2)
+    with pytest.raises(Fault, match=": no room \N{REPLACEMENT CHARACTER}; see "):
+        train_side_by_side([job], alone)
 
 
 @pytest.mark.parametrize("code", [-signal.SIGKILL, 1])

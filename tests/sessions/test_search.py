@@ -24,7 +24,7 @@ from atlantis_exp.commands.overrides import check
 from atlantis_exp.commands.search import SearchConfig, search_of
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import Metrics, Tags, read, read_commit
+from atlantis_exp.runs.journal import Journal, Metrics, Tags, read, read_commit
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.stopping import StopRequest
 from atlantis_exp.sessions.training import train
@@ -101,6 +101,16 @@ def test_a_search_trains_its_trials_under_a_run_of_its_own_and_goes_on_where_mor
     page = read_commit(trials.folder.path)
     assert page is not None
     assert page.status == "FINISHED"
+
+
+def test_a_search_that_only_waits_writes_nothing(searching: Searching) -> None:
+    trials = trials_of(searching)
+    journal = Journal(trials.folder.path)
+    trials.describe(journal)
+    written = (trials.folder.path / "journal.jsonl").stat().st_size
+    assert written
+    trials.describe(journal)
+    assert (trials.folder.path / "journal.jsonl").stat().st_size == written
 
 
 @pytest.mark.slow

@@ -4,6 +4,8 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
+from atlantis_exp import terminal
+
 T = TypeVar("T")
 
 
@@ -23,7 +25,7 @@ BASIC = Launcher()
 
 
 def in_turn(work: Callable[[T], object], jobs: Iterable[T]) -> None:
-    """Do jobs one after the other; go on after an error, and raise the first one at the end.
+    """Do jobs one after the other; go on after an error, print all but the first, and raise that one at the end.
 
     A signal that came too late to stop a job ends the process after that job.
     """
@@ -32,9 +34,13 @@ def in_turn(work: Callable[[T], object], jobs: Iterable[T]) -> None:
         try:
             late = work(job)
         except Exception as error:
+            if first is not None:
+                terminal.warn(str(error))
             first = first or error
         else:
             if isinstance(late, int):
+                if first is not None:
+                    terminal.warn(str(first))
                 sys.exit(128 + late)
     if first is not None:
         raise first

@@ -25,6 +25,7 @@ from atlantis_exp.sessions.launchers import BASIC, Launcher
 
 _ON_A_GPU = 4  # trainings that share one without loss: docs/performance.md
 _PROCESS_BYTES = 2**30  # of memory that a training takes besides its replay memory
+_LAST_BYTES = 10_000  # of a job's output, whose last line says why it failed
 _COMPRESSED = 8  # least compression of observations, also of whole screens
 
 
@@ -53,26 +54,29 @@ def fitting(jobs: Sequence[Job], planned: int) -> Launcher:
     """
     configs = [job.config for job in jobs]
     on_gpu = any(choose_device(config.device).type != "cpu" for config in configs)
-    memory = psutil.virtual_memory().available
-    at_once, cores = fitted(configs, planned, all_cores(), here().cores, memory, on_gpu)
+    memory = psutil.virtual_memory()
+    at_once, cores = fitted(configs, planned, all_cores(), here().cores, memory.total, memory.available, on_gpu)
     return BASIC if at_once == 1 else Launcher("joblib", {"n_jobs": at_once, "cores": cores})
 
 
-def fitted(configs: Sequence[Config], planned: int, cores: int, own: int, memory: int, on_gpu: bool) -> tuple[int, int]:
+def fitted(
+    configs: Sequence[Config], planned: int, cores: int, own: int, memory: int, free: int, on_gpu: bool
+) -> tuple[int, int]:
     """Return how many trainings a machine runs well at a time, and the cores of each.
 
     One core each trains the most seeds per hour; `threads`, `env.workers` or OMP_NUM_THREADS may ask for more. All
-    planned trainings share the cores, not those left, so that a continued one keeps its number of cores, on which its
-    last bits depend.
+    planned trainings that the machine's memory holds share the cores, not those left nor those that fit now, so that a
+    continued one keeps its number of cores, on which its last bits depend.
 
     own: cores by OMP_NUM_THREADS, or all if it is not set.
-    memory: available bytes.
+    memory, free: bytes, in all and available.
     """
     asked = [config.threads or 1 for config in configs] + [config.env.workers or 1 for config in configs]
     each = max([own if own < cores else 1, *asked])
-    most = [planned, cores // each, memory // max(map(_memory, configs)), *([_ON_A_GPU] if on_gpu else [])]
-    at_once = max(1, min(most))
-    return at_once, own if own < cores else cores // at_once
+    most = max(map(_memory, configs))
+    sharing = max(1, min([planned, cores // each, memory // most, *([_ON_A_GPU] if on_gpu else [])]))
+    at_once = max(1, min(sharing, free // most))
+    return at_once, own if own < cores else cores // sharing
 
 
 def _memory(config: Config) -> int:
@@ -117,7 +121,7 @@ def _train_apart(job: Job, running: _Running) -> None:
     if has_ended(config):
         return
     make_folder(folder.path)
-    with open(folder.path / OUTPUT, "a+", opener=no_link) as output:
+    with open(folder.path / OUTPUT, "a+", errors="replace", opener=no_link) as output:
         start = output.tell()
         if running.has_ended:
             raise Fault(f"run {folder.name}: the sweep has ended", exit_code=128 + signal.SIGTERM)
@@ -130,10 +134,10 @@ def _train_apart(job: Job, running: _Running) -> None:
             process.terminate()
         code = process.wait()
         running.processes.discard(process)
-        output.seek(start)
+        if code == 0:
+            return
+        output.seek(max(start, output.seek(0, os.SEEK_END) - _LAST_BYTES))
         said = output.read().splitlines()
-    if code == 0:
-        return
     reason = (
         f"killed by {signal.Signals(-code).name}"
         if code < 0
