@@ -40,7 +40,7 @@ Frameskip = Annotated[int, Field(ge=1, le=256)]
 _MOST_OBSERVATIONS = 16  # in a state
 _Lag = Annotated[int, Field(ge=0, le=64)]  # steps; each environment keeps as many observations, also in checkpoints
 _MOST_GAMES = 64  # of an evaluation, side by side
-Episodes = Annotated[int, Field(ge=1, le=10**6)]  # of one evaluation
+Episodes = Annotated[int, Field(ge=1, le=50_000)]  # of one evaluation, whose table can be read
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Size = Annotated[int, Field(ge=8, le=210)]
 Rate = Annotated[float, Field(ge=1e-10, le=10)]

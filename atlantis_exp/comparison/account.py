@@ -7,9 +7,10 @@ pairs of groups, alone or among others. It also says how much other questions ab
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from types import MappingProxyType
+from typing import Annotated, Any, NamedTuple
 
-from pydantic import TypeAdapter
+from pydantic import Field, TypeAdapter
 
 from atlantis_exp.comparison.decision import Look
 from atlantis_exp.comparison.gather import UNREADABLE
@@ -25,11 +26,13 @@ class Asked:
     """A question about runs, as its folder keeps it."""
 
     by: list[str]
-    error: float
+    error: Annotated[float, Field(gt=0, lt=1)]
     delta: float | None
     relative: bool
     baseline: str | None
-    groups: Sequence[list[str] | str]  # label, and hashes of its runs without their seeds
+    groups: Sequence[
+        Annotated[list[str], Field(min_length=1)] | str
+    ]  # label, and hashes of its runs without their seeds
     compared: list[str]  # all runs that it was ever asked about
     account: str = ""  # the comparison whose looks it continues; empty for its own
     errors: dict[str, float] = field(default_factory=dict)  # of the families that continue one
@@ -98,6 +101,8 @@ def read_account(
     folder: RunFolder, asked: Sequence[Family], question: Mapping[str, Any], runs: Sequence[str]
 ) -> Account:
     """Return the account of a question, read from all comparisons next to its folder.
+
+    Other comparisons that cannot be read count as if they had spent nothing, and a line names them.
 
     Raises: Fault if the folder's own looks are damaged or gone.
     """
@@ -176,10 +181,15 @@ def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], 
     return Account(record, errors, root, mine.compared, lines, is_warned=bool(told or gone))
 
 
-def seeds_between(seeds: Mapping[str, Collection[int]], lost: Collection[int] = ()) -> dict[str, list[int]]:
-    """Return the seeds that a group lacks below its last one, though another group has them; `lost` ones excluded."""
-    every = {seed for own in seeds.values() for seed in own} - {*lost}
-    missing = {label: sorted(seed for seed in every - {*own} if seed < max(own)) for label, own in seeds.items()}
+def seeds_between(
+    seeds: Mapping[str, Collection[int]], lost: Mapping[str, Collection[int]] = MappingProxyType({})
+) -> dict[str, list[int]]:
+    """Return the seeds that a group lacks below its last one, though another group has them, without its lost ones."""
+    every = {seed for own in seeds.values() for seed in own}
+    missing = {
+        label: sorted(seed for seed in every - {*own, *lost.get(label, ())} if seed < max(own))
+        for label, own in seeds.items()
+    }
     return {label: found for label, found in missing.items() if found}
 
 

@@ -11,9 +11,11 @@ depends on that.
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 from scipy.special import nctdtr, stdtrit
 
 from atlantis_exp.documents import Said
@@ -85,8 +87,8 @@ class Verdict:
 class Look:
     """A look that was taken, with all that the next one needs; `dataclasses.asdict` gives JSON."""
 
-    seeds: dict[str, list[int]]  # of each tested group
-    error: float  # spent by this look
+    seeds: Annotated[dict[str, list[int]], Field(min_length=1)]  # of each tested group
+    error: Annotated[float, Field(gt=0, le=1)]  # spent by this look
     verdicts: list[Verdict]  # of the pairs open until then
 
     @property
@@ -178,15 +180,15 @@ def modes(values: npt.ArrayLike) -> Modes | None:
     return Modes(upper.size / ordered.size, float(upper.mean()), float(lower.mean()))
 
 
-def mean_interval(values: npt.ArrayLike, level: float = 0.95) -> tuple[float, float]:
-    """Return Student's interval of the mean over seeds, one value per seed; NaN for fewer than two.
+def mean_interval(values: npt.ArrayLike) -> tuple[float, float]:
+    """Return Student's 95 % interval of the mean over seeds, one value per seed; NaN for fewer than two.
 
     `python -m benchmarks.decisions` measures its coverage for values that are not normal.
     """
     seeds = np.asarray(values, np.float64)
     if seeds.size < 2:
         return np.nan, np.nan
-    half = -stdtrit(seeds.size - 1, (1 - level) / 2) * seeds.std(ddof=1) / np.sqrt(seeds.size)
+    half = -stdtrit(seeds.size - 1, 0.025) * seeds.std(ddof=1) / np.sqrt(seeds.size)
     return float(seeds.mean() - half), float(seeds.mean() + half)
 
 
@@ -247,13 +249,16 @@ def condition(verdict: Verdict, look: Look, groups: Mapping[str, Mapping[int, fl
     return Condition(spreads, undone_by, 1 - 0.05 ** (1 / verdict.seeds))
 
 
-def size_found(verdict: Verdict, look: Look) -> float:
+def size_found(verdict: Verdict, look: Look, pairs: int) -> float:
     """Return a decided difference, corrected for the bias that a look finds large ones (Zhong and Prentice 2008).
 
-    It is the median-unbiased estimate, given that this look decided, by the noncentral t.
+    It is median-unbiased in units of the estimated standard error, for one look at the level of Holm's first step. Over
+    both looks of the default plan the truth is above it in 57 to 69 % of the decisions, if 0.5 to 3 sd apart.
+
+    pairs: those that share the look's error: with delta all of the family, else the open ones.
     """
     freedom = 2 * (verdict.seeds - 1)
-    limit = -stdtrit(freedom, look.error / len(look.verdicts) / 2)
+    limit = -stdtrit(freedom, look.error / pairs / 2)
     error = (verdict.high - verdict.low) / 2 / limit
     t = float(abs(verdict.difference) / error)
 

@@ -19,7 +19,6 @@ from atlantis_exp.comparison.gather import (
     UNREADABLE,
     Evaluated,
     StoredRun,
-    fits,
     named_by,
     read_runs,
 )
@@ -27,6 +26,7 @@ from atlantis_exp.comparison.published import Row
 from atlantis_exp.components import facts_of, known
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.episodes import EpisodeTable
+from atlantis_exp.runs.folder import fits
 from atlantis_exp.runs.journal import curve
 from atlantis_exp.statistics import summarize
 

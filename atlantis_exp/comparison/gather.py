@@ -5,7 +5,6 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 from math import isfinite, nan
 from operator import itemgetter
 from pathlib import Path
@@ -21,7 +20,7 @@ from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.games import Game
 from atlantis_exp.runs.episodes import EpisodeTable
 from atlantis_exp.runs.facts import read_facts, read_tags
-from atlantis_exp.runs.folder import BEST_EPISODE, EVALUATION, RESULT, RunFolder
+from atlantis_exp.runs.folder import BEST_EPISODE, EVALUATION, RESULT, RunFolder, fits
 from atlantis_exp.runs.journal import curve
 from atlantis_exp.statistics import interquartile_mean
 
@@ -151,7 +150,7 @@ class Gathered:
     trainings: list[Training] = field(default_factory=list)
     players: list[Player] = field(default_factory=list)
     skipped: dict[str, str] = field(default_factory=dict)
-    lost: list[StoredRun] = field(default_factory=list)  # trainings among `skipped`: unfinished, failed or damaged
+    lost: list[StoredRun] = field(default_factory=list)  # trainings among `skipped`: unfinished, or without a score
 
 
 class _Unusable(ValueError):
@@ -327,18 +326,6 @@ def named_by(outputs: Path, runs: Iterable[str]) -> list[str]:
         names = [run for run in of if isinstance(run, str)] if isinstance(of, list) else []
         patterns += names or [text]
     return patterns
-
-
-def fits(name: str, patterns: Sequence[str]) -> bool:
-    """Return whether a run's name starts with or matches one of the patterns, or there are none.
-
-    A pattern that ends in a seed matches only that seed: `cnn-uniform-s1` does not match s10.
-    """
-    rests = ("[!0-9]*" if re.search(r"s\d+$", pattern) else "*" for pattern in patterns)
-    return not patterns or any(
-        fnmatchcase(name, pattern) or fnmatchcase(name, pattern + rest)
-        for pattern, rest in zip(patterns, rests, strict=True)
-    )
 
 
 def refuse_unknown(outputs: Path, runs: Iterable[str]) -> None:

@@ -102,13 +102,15 @@ def conditions(facts: Facts) -> Iterator[str]:
         if verdict.said in ("better", "worse"):
             one, other = verdict.leading.group, verdict.leading.other
             found = condition(verdict, look, answer.family.seeds)
+            sharing = look.verdicts if answer.family.plan.delta is None else answer.decision.verdicts
+            size = points(abs(size_found(verdict, look, len(sharing))))
             times = f"{found.spreads:.1f} times as much in one group"
             here = times if isfinite(found.spreads) else "those of one group do not vary"
             yield (
                 f"{one} against {other}: a look overstates the difference that it finds; the true one is rather "
-                f"{points(abs(size_found(verdict, look)))} points. The verdict assumes that seeds vary alike (here "
-                f"{here}). It would not hold if {found.undone_by:.0%} of the seeds of {one} collapsed; "
-                f"{verdict.seeds} seeds cannot exclude up to {found.unseen:.0%}."
+                f"{size} points. The verdict assumes that seeds vary alike (here {here}). It would not hold if "
+                f"{found.undone_by:.0%} of the seeds of {one} collapsed; {verdict.seeds} seeds "
+                f"cannot exclude up to {found.unseen:.0%}."
             )
 
 
@@ -139,10 +141,10 @@ def unusual_runs(facts: Facts) -> Iterator[str]:
 
 def missing_seeds(facts: Facts) -> Iterator[str]:
     """Name the seeds that a group lacks: unfinished, damaged, or left out, perhaps for their scores."""
-    seeds = {label: {run.config["seed"] for run in runs} for label, runs in facts.groups.items()}
-    names = defaultdict(list)
+    seeds, names, lost = {each.label: {*each.seeds} for each in facts.scored}, defaultdict(list), defaultdict(set)
     for run in facts.lost:
         label = " ".join(values_in(run.facts, facts.by)) or "all"
+        lost[label].add(run.config["seed"])
         if run.config["seed"] not in seeds.get(label, ()):
             names[label].append(run.name)
     for label, missing in names.items():
@@ -150,7 +152,7 @@ def missing_seeds(facts: Facts) -> Iterator[str]:
             f"{label} lacks {len(missing)} {'seed' if len(missing) == 1 else 'seeds'}, unfinished or unusable: "
             f"{listed(missing)}. If scores are the reason, the other seeds are not representative."
         )
-    for label, left_out in seeds_between(seeds, {run.config["seed"] for run in facts.lost}).items():
+    for label, left_out in seeds_between(seeds, lost).items():
         yield (
             f"{label} lacks seed {listed([*map(str, left_out)])}, which others have. If its score is the "
             "reason, the error does not hold."

@@ -9,7 +9,7 @@ from ale_py import ALEInterface, ALEState, LoggerMode
 from ale_py.roms import get_all_rom_ids, get_rom_path
 
 from atlantis_exp.faults import ConfigError
-from atlantis_exp.game.preprocessing import PALETTE, SCREEN_HEIGHT, SCREEN_WIDTH, Pixels, Preprocessing
+from atlantis_exp.game.preprocessing import SCREEN_HEIGHT, SCREEN_WIDTH, Pixels, Preprocessing
 from atlantis_exp.games import Game
 
 ALEInterface.setLoggerMode(LoggerMode.Error)  # of the whole process, and before the first emulator prints its banner
@@ -77,8 +77,8 @@ class Emulator:
         self._ale.setInt("max_num_frames_per_episode", max_frames)
         self._is_loaded = False  # loading takes as long as a thousand frames, and each seed needs it
         self._steps = 0
-        self._screen: Pixels = np.zeros((SCREEN_HEIGHT, SCREEN_WIDTH), np.uint8)
-        self._pool = preprocessing.grey(self._screen)  # of the last step, cropped; max_pool only
+        self._screen: Pixels = np.zeros((SCREEN_HEIGHT, SCREEN_WIDTH), np.uint8)  # grey
+        self._pool = preprocessing.cut(self._screen)  # of the last step, cropped; max_pool only
 
     @property
     def lives(self) -> int:
@@ -87,7 +87,7 @@ class Emulator:
 
     def screen_rgb(self) -> Pixels:
         """Return the frame on screen in colour, (210, 160, 3) uint8."""
-        return PALETTE.take(self._screen, axis=0)
+        return self._ale.getScreenRGB()
 
     def reset(self, seed: int | None = None) -> Pixels:
         """Begin an episode and return its first observation; without a seed the random streams continue."""
@@ -101,8 +101,8 @@ class Emulator:
                 self._ale.act(self._actions[0])
         self._steps = 0
         self._lives = self.lives
-        self._ale.getScreen(self._screen)
-        self._pool = self.preprocessing.grey(self._screen)
+        self._ale.getScreenGrayscale(self._screen)
+        self._pool = self.preprocessing.cut(self._screen)
         return self.preprocessing.resize(self._pool)
 
     def step(self, action: int) -> Step:
@@ -118,7 +118,7 @@ class Emulator:
         else:
             # Past the episode's end ALE emulates nothing, but still draws for the sticky actions.
             reward = sum(self._act(action) for _ in range(frameskip))
-        self._ale.getScreen(self._screen)
+        self._ale.getScreenGrayscale(self._screen)
         observation = self.preprocessing.resize(self._pool) if self._max_pool else self.preprocessing(self._screen)
         self._steps += 1
         terminated = self._ale.game_over(with_truncation=False)
@@ -196,8 +196,8 @@ class Emulator:
             if self._ale.game_over():
                 break
             if left <= 1:
-                self._ale.getScreen(self._screen)
-                before_last, last = last, self.preprocessing.grey(self._screen)
+                self._ale.getScreenGrayscale(self._screen)
+                before_last, last = last, self.preprocessing.cut(self._screen)
         self._pool = np.maximum(before_last, last)
         return reward
 

@@ -13,30 +13,12 @@ Envs = Sequence[int] | npt.NDArray[np.intp]
 
 SCREEN_HEIGHT, SCREEN_WIDTH = 210, 160  # pixels
 
-# RRGGBB of the 128 colours of the NTSC console as ALE draws them (its src/ale/common/Palettes.hpp).
-_NTSC = bytes.fromhex(
-    "0000004a4a4a6f6f6f8e8e8eaaaaaac0c0c0d6d6d6ececec48480069690f86861da2a22abbbb35d2d240e8e84afcfc54"
-    "7c2c00904811a26221b47a30c3903dd2a44adfb755ecc860901c00a33915b55328c66c3ad5824ae39759f0aa67fcbc74"
-    "940000a71a1ab83232c84848d65c5ce46f6ff08080fc909084006497197aa8308fb846a2c659b3d46cc3e07cd2ec8ce0"
-    "50008468199a7d30ad9246c0a459d0b56ce0c57ceed48cfc140090331aa34e32b56848c67f5cd5956fe3a980f0bc90fc"
-    "000094181aa72d32b84248c8545cd6656fe47580f08490fc001c88183b9d2d57b04272c2548ad265a0e175b5ef84c8fc"
-    "0030641850802d6d984288b054a0c565b7d975cceb84e0fc00403018624e2d8169429e8254b89965d1ae75e7c284fcd4"
-    "0044001a661a32843248a0485cba5c6fd26f80e88090fc90143c00355f18527e2d6e9c4287b7549ed065b4e775c8fc84"
-    "3038005059166d762b88923ea0ab4fb7c25fccd86ee0ec7c482c00694d14866a26a28638bb9f47d2b656e8cc63fce070"
-)
-
-PALETTE: Pixels = np.repeat(np.frombuffer(_NTSC, np.uint8).reshape(128, 3), 2, axis=0)
-"""RGB of each palette index, (256, 3): the console ignores the lowest bit of a colour."""
-
-GREY = cast(Pixels, cv2.cvtColor(PALETTE[np.newaxis], cv2.COLOR_RGB2GRAY)[0])
-"""Grey of each palette index, (256,): OpenCV's RGB2GRAY (report figure 2.3) and, in every colour, ALE's own grey."""
-
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """Turn a screen of palette indices, (210, 160) uint8, into an observation, (size, size) uint8.
+    """Turn a screen in ALE's grey, (210, 160) uint8, into an observation, (size, size) uint8.
 
-    Grey, crop, area interpolation: within one grey level of 255 times the float of report figure 2.3. `crop` is its
+    Crop, area interpolation: within one grey level of 255 times the float of report figure 2.3. `crop` is its
     `exclude`, (UP, RIGHT, DOWN, LEFT) in pixels, and keeps rows UP to DOWN - 1 and columns LEFT to RIGHT - 1. Raises
     ValueError if it leaves the screen.
     """
@@ -50,16 +32,16 @@ class Preprocessing:
             raise ValueError(f"crop (UP, RIGHT, DOWN, LEFT) = {self.crop} is not inside a 210x160 screen")
 
     def __call__(self, screen: Pixels) -> Pixels:
-        return self.resize(self.grey(screen))
+        return self.resize(self.cut(screen))
 
-    def grey(self, screen: Pixels) -> Pixels:
-        """Return the crop of a screen of palette indices in grey, (DOWN - UP, RIGHT - LEFT) uint8."""
+    def cut(self, screen: Pixels) -> Pixels:
+        """Return a copy of the crop of a screen, (DOWN - UP, RIGHT - LEFT) uint8."""
         up, right, down, left = self.crop
-        return cast(Pixels, cv2.LUT(screen[up:down, left:right], GREY))
+        return screen[up:down, left:right].copy()
 
-    def resize(self, grey: Pixels) -> Pixels:
-        """Return a crop in grey at the observation's size, (size, size) uint8."""
-        return cast(Pixels, cv2.resize(grey, (self.size, self.size), interpolation=cv2.INTER_AREA))
+    def resize(self, cut: Pixels) -> Pixels:
+        """Return a crop at the observation's size, (size, size) uint8."""
+        return cast(Pixels, cv2.resize(cut, (self.size, self.size), interpolation=cv2.INTER_AREA))
 
 
 class FrameStack:

@@ -109,7 +109,7 @@ class PrioritizedSampler:
 
     def feed_back(self, ids: npt.NDArray[np.int64], errors: npt.NDArray[np.float32]) -> None:
         # A priority that is NaN, or an infinite sum, would make `_find` loop forever.
-        priorities = (np.nan_to_num(errors.astype(np.float64), posinf=_MOST_ERROR) + _LEAST_ERROR) ** self.alpha
+        priorities = (np.minimum(np.nan_to_num(errors.astype(np.float64)), _MOST_ERROR) + _LEAST_ERROR) ** self.alpha
         self._set(ids % self._capacity, priorities)
         self._highest = max(self._highest, float(priorities.max()))
 

@@ -3,9 +3,11 @@
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal, Self, TypeVar
 
@@ -222,8 +224,22 @@ def all_runs(outputs: Path) -> list[RunFolder]:
     return [RunFolder(path.parent) for path in sorted((outputs / "runs").glob(f"*/{CONFIG}"))]
 
 
+def fits(name: str, patterns: Sequence[str]) -> bool:
+    """Return whether a run's name starts with or matches one of the patterns, or there are none.
+
+    A pattern that ends in a seed matches only that seed: `cnn-uniform-s1` does not match s10.
+    """
+    rests = ("[!0-9]*" if re.search(r"s\d+$", pattern) else "*" for pattern in patterns)
+    return not patterns or any(
+        fnmatchcase(name, pattern) or fnmatchcase(name, pattern + rest)
+        for pattern, rest in zip(patterns, rests, strict=True)
+    )
+
+
 def find_run(outputs: Path, name: str) -> RunFolder:
-    """Return the training run with a name or a unique start of one, or the latest.
+    """Return the training run of a name, or the only one that a start or pattern of names fits, or the latest.
+
+    A start or pattern fits none that `resume=never` put aside.
 
     Raises:
         ConfigError: no run or several match.
@@ -244,7 +260,7 @@ def find_run(outputs: Path, name: str) -> RunFolder:
     if name == "latest":
         return max(folders, key=lambda folder: (folder.path / CONFIG).stat().st_mtime)
     matching = [folder for folder in folders if folder.name == name] or [
-        folder for folder in folders if folder.name.startswith(name)
+        folder for folder in folders if "~" not in folder.name and fits(folder.name, [name])
     ]
     if len(matching) == 1:
         return matching[0]

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from atlantis_exp import terminal
 from atlantis_exp.documents import Report, Reported
-from atlantis_exp.runs.folder import EVALUATED, TABLE_COLUMNS, RunFolder, all_runs
+from atlantis_exp.runs.folder import EVALUATED, TABLE_COLUMNS, RunFolder, all_runs, fits
 from atlantis_exp.runs.journal import Metrics
 from atlantis_exp.tracking.publishing import catch_up, how_to_open
 
@@ -61,7 +61,7 @@ def _chosen(outputs: Path, runs: Sequence[str], where: Sequence[str]) -> list[Ru
         return all_runs(outputs)
     # Numpy takes a fifth of a second to import.
     from atlantis_exp.comparison.choosing import select
-    from atlantis_exp.comparison.gather import fits, named_by, read_runs, refuse_unknown
+    from atlantis_exp.comparison.gather import named_by, read_runs, refuse_unknown
 
     refuse_unknown(outputs, runs)
     patterns = named_by(outputs, runs)

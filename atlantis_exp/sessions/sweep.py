@@ -64,8 +64,9 @@ def sweep(
 def ledger(
     jobs: Sequence[Job], swept: Sequence[str] = (), launcher: Launcher = BASIC, command: str = ""
 ) -> Iterator[None]:
-    """Print a sweep's table of runs before and after the block, and keep its page, unless this process trains and tracking is none.
+    """Print a sweep's table of runs before and after the block, and keep its page.
 
+    There is no page if this process trains them and tracking is none.
     Jobs in other processes only write their folders: this process shows their progress and publishes them. Each run's
     folder names its parent before the first run starts; the same set of runs has the same parent. Arguments and faults
     as for `sweep`.

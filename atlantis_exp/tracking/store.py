@@ -67,11 +67,9 @@ class Store:
         """The database or server, and the experiment."""
         return f"{self.uri}#{self._experiment}"
 
-    def runs(self, name: str | None = None) -> "list[Run]":
-        """Return the published runs, the latest first; with a name, only those of that name."""
-        published = f"tags.`{FOLDER}` != ''"
-        wanted = published if name is None else f'{published} AND attributes.run_name = "{name}"'
-        return all_pages(partial(self.client.search_runs, [self.experiment_id], wanted))
+    def runs(self) -> "list[Run]":
+        """Return the published runs, the latest first."""
+        return all_pages(partial(self.client.search_runs, [self.experiment_id], f"tags.`{FOLDER}` != ''"))
 
     def models(self, run_id: str) -> "list[LoggedModel]":
         same = f"source_run_id = '{run_id}'"
@@ -79,9 +77,10 @@ class Store:
 
     def prepare(self) -> None:
         """Write the experiment's description and shared views."""
-        newest = next((run for run in self.runs() if run.data.tags.get("atlantis.kind") == "comparison"), None)
+        comparisons = "tags.`atlantis.kind` = 'comparison'"
+        newest = self.client.search_runs([self.experiment_id], comparisons, max_results=1)
         place = f"#/experiments/{self.experiment_id}/runs"
-        linked = f"[{newest.info.run_name}]({place}/{newest.info.run_id})" if newest else None
+        linked = f"[{newest[0].info.run_name}]({place}/{newest[0].info.run_id})" if newest else None
         for key, value in experiment_tags(linked).items():
             self.client.set_experiment_tag(self.experiment_id, key, value)
 

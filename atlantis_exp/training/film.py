@@ -21,7 +21,6 @@ class Moment(NamedTuple):
 
     screen: npt.NDArray[np.uint8]  # (210, 160, 3)
     score: float  # so far
-    frame: int  # so far
     action: int | None
     random: bool
     q_values: npt.NDArray[np.float32] | None  # (actions,), the network's, even if chance chose
@@ -31,15 +30,14 @@ def moments(episode: Episode, emulator: Emulator, start: int = 0) -> Iterator[Mo
     """Play an episode again from its seed and actions; yield its moments from step `start` on."""
     emulator.reset(episode.seed)
     values = episode.values
-    score, frame = 0.0, 0
+    score = 0.0
     for index, (action, random) in enumerate(zip(episode.actions, episode.random, strict=True)):
         if index >= start:
             q_values = None if values is None else values[index]
-            yield Moment(emulator.screen_rgb(), score, frame, action, bool(random), q_values)
+            yield Moment(emulator.screen_rgb(), score, action, bool(random), q_values)
         step = emulator.step(action)
         score += step.reward
-        frame += step.frames
-    yield Moment(emulator.screen_rgb(), score, frame, None, False, None)
+    yield Moment(emulator.screen_rgb(), score, None, False, None)
 
 
 def span(episode: Episode, part: Part) -> tuple[int, int]:

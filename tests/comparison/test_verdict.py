@@ -615,6 +615,17 @@ def test_runs_that_were_asked_before_go_on_with_their_looks_and_are_told_of_othe
     assert "which has 3 pairs in all" in run("runs=cnn,resnet_fast")
     assert "cannot be read" not in whole
     broken = next((tmp_path / "comparisons").glob("cnn-vs-resnet-vs-*")) / "looks.json"
+    for name, before, after in (
+        ("config.json", '"error": 0.05', '"error": 0.0'),
+        ("config.json", '"groups": [', '"groups": [[], '),
+        ("looks.json", '"seeds": {', '"seeds": {}, "of": {'),
+        ("looks.json", '"error": 0', '"error": 1e308, "of": 0'),
+    ):
+        sound = (broken.parent / name).read_text()
+        (broken.parent / name).write_text(sound.replace(before, after))
+        assert before in sound
+        assert f"cannot be read: {broken.parent.name}." in run("runs=cnn,resnet-")
+        (broken.parent / name).write_text(sound)
     broken.write_text("{}"[:1])
     assert f"cannot be read: {broken.parent.name}." in run("runs=cnn,resnet-")
     assert run(code=1).startswith(f"atlantis_exp: {broken} is not a record")
@@ -812,3 +823,11 @@ def test_a_seed_that_one_group_lacks_below_its_others_is_named() -> None:
     runs = [*around("a", 1_000, (0, 1, 3, 4, 5)), *around("b", 1_000, range(8))]
     (line,) = (line for line in compared(runs).caveats if " lacks seed " in line)
     assert line.startswith("a lacks seed 2, which others have.")
+
+
+def test_a_seed_that_one_group_lacks_is_named_beside_a_run_of_that_seed_that_another_has_lost() -> None:
+    runs = [*around("a", 1_000, (0, 1, 3, 4, 5)), *around("b", 1_000, range(8))]
+    there = of("c", 2, (0.0,))
+    gathered = Gathered(runs, lost=[StoredRun(there.name, there.config, {}, RunFolder(Path("c")), None, [])])
+    caveats = compare(gathered, group(runs, ["model"]), Question(["model"])).caveats
+    assert [line.partition(",")[0] for line in caveats if " lacks " in line] == ["c lacks 1 seed", "a lacks seed 2"]

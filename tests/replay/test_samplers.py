@@ -179,7 +179,7 @@ def test_a_new_transition_has_the_highest_priority_there_was() -> None:
     assert newest / of_priority_one == pytest.approx(8, rel=0.01)
 
 
-@pytest.mark.parametrize("poison", [np.nan, np.inf])
+@pytest.mark.parametrize("poison", [np.nan, np.inf, 1e35])
 @pytest.mark.parametrize("alpha", [0.5, 1.0])
 @pytest.mark.timeout(60)  # seconds
 def test_errors_that_are_no_numbers_do_not_hang_the_search(poison: float, alpha: float) -> None:
@@ -187,6 +187,7 @@ def test_errors_that_are_no_numbers_do_not_hang_the_search(poison: float, alpha:
     sampler.sample(memory, 2, np.random.default_rng(0))
     sampler.feed_back(np.arange(4), np.full(4, poison, np.float32))
     assert np.isfinite(sampler.state_dict()["priorities"].sum())
+    PrioritizedSampler(alpha, 0.5).load_state_dict(sampler.state_dict())
     assert len(sampler.sample(memory, 5, np.random.default_rng(0)).ids) == 5
 
 

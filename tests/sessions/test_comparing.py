@@ -233,6 +233,13 @@ def test_a_table_of_scores_is_drawn_with_its_seeds_and_nothing_else(tmp_path: Pa
         assert f"<h2>{heading}" not in page.read_text()
 
 
+def test_a_seed_that_one_group_of_a_table_lacks_is_named(tmp_path: Path, of_json: Callable[..., Compared]) -> None:
+    rows = [f"{group},{seed},{seed}" for group in ("a", "b") for seed in range(8) if (group, seed) != ("b", 2)]
+    (tmp_path / "s.csv").write_text("\n".join(["group,seed,score", *rows]))
+    answer = of_json(f"scores={tmp_path / 's.csv'}")
+    assert any(caveat.startswith("b lacks seed 2, which others have.") for caveat in answer.caveats)
+
+
 def test_another_column_of_a_table_is_another_question_in_points_as_small_as_its_own(
     tmp_path: Path, of_json: Callable[..., Compared]
 ) -> None:

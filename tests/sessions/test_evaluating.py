@@ -6,6 +6,7 @@ The person's window is SDL's dummy screen here.
 import csv
 import json
 import re
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +22,7 @@ from atlantis_exp.commands.composing import checked
 from atlantis_exp.commands.play import PlayConfig
 from atlantis_exp.comparison.gather import gather
 from atlantis_exp.faults import Fault
-from atlantis_exp.runs.folder import RunFolder
+from atlantis_exp.runs.folder import RunFolder, find_run
 from atlantis_exp.sessions import evaluating
 from atlantis_exp.sessions.evaluating import _held, _placeable, play, play_baseline
 from atlantis_exp.sessions.reporting import report
@@ -60,6 +61,14 @@ def test_an_unknown_run_is_one_line_that_names_the_nearest(
     error = capsys.readouterr().err
     assert error.startswith(line)
     assert error.count("\n") == 1
+
+
+def test_a_run_is_found_by_a_start_with_its_seed_beside_others_and_those_put_aside(stored: Path) -> None:
+    for name in ("cnn-uniform-s1-bb~1", "cnn-uniform-s10-cc"):
+        shutil.copytree(stored / "runs" / "cnn-uniform-s1-bb", stored / "runs" / name)
+    for name in ("cnn-uniform-s1", "cnn-uniform-s1-b", "cnn-*-s1-*", "cnn-uniform-s1-bb"):
+        assert find_run(stored, name).name == "cnn-uniform-s1-bb"
+    assert find_run(stored, "cnn-uniform-s1-bb~1").name == "cnn-uniform-s1-bb~1"
 
 
 def test_no_run_at_all_is_one_line_and_nothing_is_created(
