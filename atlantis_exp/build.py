@@ -75,11 +75,6 @@ def make_emulator(env: cfg.EnvConfig) -> partial[Emulator]:
     )
 
 
-def build_emulators(env: cfg.EnvConfig, cores: int, num_envs: int) -> Emulators:
-    """Return emulators; several run in worker processes, one per core unless `env.workers` is set."""
-    return make_emulators(make_emulator(env), num_envs, env.workers or cores)
-
-
 def choose_device(name: str) -> torch.device:
     """Return the device of that name; `auto` is the GPU if there is one. Raises: ConfigError."""
     if name == "auto":

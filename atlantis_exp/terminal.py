@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from rich.console import Console
+from rich.table import Column, Table
 from rich.text import Text
 
 _HERE = Path(__file__).parent
@@ -62,6 +63,11 @@ def console(least: int | None = None) -> Console:
     if least is None:
         return _Console(soft_wrap=True)
     return _Console(width=max(shutil.get_terminal_size().columns, least))
+
+
+def table(*columns: str, title: str | None = None) -> Table:
+    """Return a table whose first column is left-justified, the others right-justified."""
+    return Table(columns[0], *(Column(each, justify="right") for each in columns[1:]), title=title)
 
 
 def harmless(text: str) -> str:

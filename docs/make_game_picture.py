@@ -9,8 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from atlantis_exp.build import build_emulators, make_emulator
+from atlantis_exp.build import make_emulator
 from atlantis_exp.game.atlantis import Atlantis
+from atlantis_exp.game.vector import make_emulators
 from atlantis_exp.media import scene
 from atlantis_exp.sessions.cards import build_exported_actor, read_card
 from atlantis_exp.training.evaluation import evaluate
@@ -24,7 +25,7 @@ def main() -> None:
     card, weights = read_card(Path("pretrained/cnn_fast"))
     env = dataclasses.replace(card.config.env, max_steps=STEPS, workers=1)
     actor = build_exported_actor(card.config, weights, "cpu")
-    with build_emulators(env, 1, 1) as emulators:
+    with make_emulators(make_emulator(env), 1, 1) as emulators:
         protocol = {"epsilon": card.evaluation.epsilon, "seed": 0, "size": env.size, "lags": env.lags}
         (episode,) = evaluate(actor, emulators, episodes=1, **protocol).episodes  # type: ignore[arg-type]
     latest: dict[bool, tuple[int, Moment]] = {}

@@ -14,16 +14,16 @@ import torch
 
 from atlantis_exp import build
 from atlantis_exp.build import (
-    build_emulators,
     build_evaluator,
     build_learner,
     build_memory,
     build_network_actor,
     import_components,
+    make_emulator,
 )
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
-from atlantis_exp.game.vector import ProcessEmulators
+from atlantis_exp.game.vector import ProcessEmulators, make_emulators
 from atlantis_exp.learning.recurrent import RecurrentLearner
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.sessions.processor import set_up_torch
@@ -132,7 +132,7 @@ def test_emulators_share_the_cores_where_the_system_does_not_say_which_are_ours(
     """As on macOS."""
     monkeypatch.delattr(os, "sched_getaffinity")
     monkeypatch.delattr(os, "sched_setaffinity")
-    with build_emulators(tiny("env.num_envs=3", "env.workers=null").env, 2, 3) as emulators:
+    with make_emulators(make_emulator(tiny().env), 3, 2) as emulators:
         assert isinstance(emulators, ProcessEmulators)
         assert len(emulators._processes) == 2
         emulators.reset(range(3), [0, 1, 2])

@@ -21,43 +21,51 @@ if TYPE_CHECKING:
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
-class CompareConfig:
+class QuestionConfig:
+    """A question about groups, but for the keys that they differ in."""
+
+    score: Literal["last", "training"]
+    window: str | float  # of score=training, a share of the steps
+    baseline: str | None  # a value of one of the keys, or a group; null: all pairs
+    delta: str | float | None  # a difference that does not matter: 5% of a score, or points
+    seeds: Annotated[int, Field(ge=5, le=10_000)]  # a group, at the last look
+    error: Annotated[float, Field(ge=1e-6, lt=1)]  # probability of any false verdict
+    format: Format
+
+    def __post_init__(self) -> None:
+        margin(self.delta)
+        share("window", self.window)
+
+    def question(self, by: Iterable[str]) -> "Question":
+        """Return the question about groups that differ in these keys."""
+        from atlantis_exp.comparison.verdict import Question
+
+        delta, relative = margin(self.delta)
+        window = share("window", self.window)
+        return Question(tuple(by), self.seeds, self.error, delta, relative, self.baseline, self.score, window)
+
+
+@dataclass(config=STRICT, kw_only=True, frozen=True)
+class CompareConfig(QuestionConfig):
     """Groups of finished runs, and the question about them."""
 
     by: list[str]  # config keys
     runs: list[str]  # names, starts of names or patterns; none: all
     where: list[str]  # KEY=VALUE; none: all
     at_epsilon: Probability | None  # of the evaluations; null: each run's latest
-    score: Literal["last", "training"]
-    window: str | float  # of score=training, a share of the steps
     scores: str | None  # a CSV file in place of runs
     columns: list[str]  # group=NAME, seed=NAME, score=NAME, of that file
-    baseline: str | None  # a value of one of the keys of by, or a group; null: all pairs
-    delta: str | float | None  # a difference that does not matter: 5% of a score, or points
-    seeds: Annotated[int, Field(ge=5, le=10_000)]  # a group, at the last look
-    error: Annotated[float, Field(ge=1e-6, lt=1)]  # probability of any false verdict
     look: Literal["due", "now"]
-    format: Format
     tracking: TrackingConfig
     paths: PathsConfig
 
     def __post_init__(self) -> None:
-        margin(self.delta)
-        share("window", self.window)
+        super().__post_init__()
         of_runs = {"by": ["model"], "score": "last", "at_epsilon": None, "runs": [], "where": []}  # defaults
         for key, value in of_runs.items():
             if self.scores is not None and getattr(self, key) != value:
                 raise ConfigError(f"{key}: applies to runs, not to scores={self.scores}; use columns=group=NAME")
         named(self.columns)
-
-    @property
-    def question(self) -> "Question":
-        """The question about the groups."""
-        from atlantis_exp.comparison.verdict import Question
-
-        delta, relative = margin(self.delta)
-        window = share("window", self.window)
-        return Question(tuple(self.by), self.seeds, self.error, delta, relative, self.baseline, self.score, window)
 
 
 def margin(delta: str | float | None) -> tuple[float | None, bool]:
@@ -111,7 +119,7 @@ def _work(asked: Asked[CompareConfig]) -> Callable[[], object]:
 
     def call() -> "Comparison":
         now = config.look == "now"
-        comparison = compare(config.question, choice, config.tracking, asked.command, look_now=now)
+        comparison = compare(config.question(config.by), choice, config.tracking, asked.command, look_now=now)
         terminal.document(comparison.document("compare").model_dump_json())
         refuse_worse_commits(comparison, config.baseline)
         return comparison

@@ -2,9 +2,8 @@
 
 import hashlib
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import MISSING, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -118,8 +117,5 @@ def _option(component: components.Component) -> dict[str, Any]:
     return node
 
 
-@contextmanager
-def composing() -> Iterator[None]:
-    """Let Hydra compose from the config groups."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        yield
+composing = partial(initialize_config_dir, str(CONF), version_base="1.3")
+"""Returns a context in which Hydra composes from the config groups."""

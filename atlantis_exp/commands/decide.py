@@ -4,14 +4,13 @@ import dataclasses
 import re
 from collections.abc import Callable, Iterable
 from functools import cache, partial
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from atlantis_exp.checking import share
 from atlantis_exp.commands.app import Asked, Verb
-from atlantis_exp.commands.compare import as_texts, listed, margin
+from atlantis_exp.commands.compare import QuestionConfig, as_texts, listed
 from atlantis_exp.commands.jobs import training_of
 from atlantis_exp.commands.overrides import (
     combined,
@@ -25,7 +24,7 @@ from atlantis_exp.commands.overrides import (
     with_first_values,
 )
 from atlantis_exp.commands.train import train_on_a_node
-from atlantis_exp.config import FREE, STRICT, Config, Format
+from atlantis_exp.config import FREE, STRICT, Config
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.job import command_line
 
@@ -34,22 +33,15 @@ if TYPE_CHECKING:
 
 
 @dataclass(config=STRICT, kw_only=True, frozen=True)
-class DecideConfig(Config):
+class DecideConfig(QuestionConfig, Config):
     """A question about contenders: trainings of this config that differ in a few keys."""
 
     against: list[str]  # overrides: with all of them, or with none
-    score: Literal["last", "training"]
-    window: str | float  # of score=training, a share of the steps
-    baseline: str | None
-    delta: str | Annotated[float, Field(gt=0)] | Annotated[int, Field(gt=0)] | None
     seeds: Annotated[int, Field(ge=5, le=1_000)]
-    error: Annotated[float, Field(ge=1e-6, lt=1)]
-    format: Format
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        margin(self.delta)
-        share("window", self.window)
+        Config.__post_init__(self)
         if not self.evaluation.at_end:
             raise ConfigError("evaluation.at_end=false: contenders are compared by the evaluation at their end")
 
@@ -94,7 +86,6 @@ def _work(asked: Asked[DecideConfig]) -> Callable[[], None]:
 
 def contest_of(asked: Asked[DecideConfig]) -> "Contest":
     """Return the contest that was asked for. Raises: ConfigError if it cannot be decided."""
-    from atlantis_exp.comparison.verdict import Question
     from atlantis_exp.sessions.deciding import Contest
 
     config, typed = asked.config, _as_texts(asked.typed)
@@ -121,15 +112,10 @@ def contest_of(asked: Asked[DecideConfig]) -> "Contest":
     texts = flags_of(typed).overrides  # as typed, before Hydra resolved ${...}
     launchers = _launchers(texts)
     shared = [text for text in texts if text not in (*several, *launchers)]
-    fixed = [text for text in shared if text.lstrip("+~").split("=")[0].split(".")[0] not in _OWN]
+    fixed = [text for text in shared if text.lstrip("~").split("=")[0].split(".")[0] not in _OWN]
     flags = [text for text in typed if text.startswith("--config-dir=")]
-    delta, relative = margin(config.delta)
-    keys = tuple(override.key_or_group for override in overrides)
     return Contest(
-        Question(
-            *(keys, config.seeds, config.error, delta, relative, config.baseline),
-            *(config.score, share("window", config.window)),
-        ),
+        config.question(override.key_or_group for override in overrides),
         contenders,
         several=several,
         fixed=fixed,

@@ -40,7 +40,7 @@ def spell_out(arguments: list[str]) -> list[str]:
 def _work(asked: Asked[EvaluateConfig]) -> Callable[[], object]:
     from atlantis_exp.sessions.evaluating import evaluate
 
-    keys = {override.split("=")[0].lstrip("+") for override in asked.overrides}
+    keys = {override.split("=")[0] for override in asked.overrides}
     return partial(evaluate, **vars(asked.config), asked=keys, command=asked.command, cores=asked.machine.cores)
 
 

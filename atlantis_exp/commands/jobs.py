@@ -29,7 +29,7 @@ def words_of(overrides: Sequence[str]) -> tuple[str, ...]:
     values: dict[str, str] = {}
     for text in flags_of(overrides).overrides:
         override = read_override(text)
-        key, value = override.get_key_element().lstrip("+"), override.value()
+        key, value = override.get_key_element(), override.value()
         word = "" if override.is_delete() else value if isinstance(value, str) else json.dumps(value)
         root = key.lstrip("~").split(".")[0]
         if key in _TITLED or root in FREE or key in ("env.workers",) or word == "none":

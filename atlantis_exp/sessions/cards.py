@@ -13,6 +13,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 from rich.table import Table
 
+from atlantis_exp import terminal
 from atlantis_exp.build import build_network_actor, described
 from atlantis_exp.checking import nearest, parse, to_dict
 from atlantis_exp.comparison.decision import mean_interval
@@ -129,9 +130,7 @@ def build_exported_actor(config: Config, weights: bytes, device: str) -> Actor:
 
 def side_by_side(card: Card, settings: EvaluationConfig, scores: Sequence[float]) -> Table:
     """Tabulate the card's scores above those played with these settings."""
-    table = Table("", *_COLUMNS)
-    for column in table.columns[1:]:
-        column.justify = "right"
+    table = terminal.table("", *_COLUMNS)
     table.add_row("card", *_points(card.evaluation, card.scores))
     table.add_row("here", *_points(settings, scores))
     return table

@@ -8,7 +8,6 @@ from pathlib import Path
 from time import strftime
 from typing import Any
 
-from rich.table import Table
 from rich.text import Text
 
 from atlantis_exp import terminal
@@ -191,9 +190,7 @@ def _print(comparison: Comparison) -> None:
     """Print scores, caveats and, last, the answers; the page has the rest."""
     console = terminal.console(least=160)
     header, *rows = plain("scores", comparison.tables["scores"], comparison.question.score)
-    table = Table(*header, title=f"scores by {', '.join(comparison.by)}")
-    for column in table.columns[1:]:
-        column.justify = "right"
+    table = terminal.table(*header, title=f"scores by {', '.join(comparison.by)}")
     for row in rows:
         table.add_row(*map(Text, row))
     console.print(table)

@@ -61,7 +61,7 @@ def check(contracts: Iterator[Contract], measured: Mapping[str, Job]) -> None:
             except Exception as error:
                 because = first_line(error) or repr(error)
             tried.append(documents.Trial(component=part, contract=contract, kept=not because, because=because))
-    table = Table("component", "contract", "", "because")
+    table = terminal.table("component", "contract", "", "because")
     for each in tried:
         table.add_row(each.component, each.contract, "kept" if each.kept else "BROKEN", each.because)
     terminal.console(least=120).print(table)
@@ -343,9 +343,7 @@ def _cost(name: str, job: Job, said: str) -> documents.Cost:
 
 
 def _table(costs: Sequence[documents.Cost]) -> Table:
-    table = Table("component", "pixels", "parameters", "FLOPs a sample", "updates/s", "steps/s")
-    for column in table.columns[1:]:
-        column.justify = "right"
+    table = terminal.table("component", "pixels", "parameters", "FLOPs a sample", "updates/s", "steps/s")
     for each in costs:
         counts = f"{each.parameters:,}", f"{each.flops_per_sample / 1e6:,.0f} M"
         speeds = f"{each.updates_per_second:,.1f}", f"{each.steps_per_second:,.0f}"

@@ -58,7 +58,7 @@ class Job:
 def replaced(overrides: Iterable[str], *others: str) -> list[str]:
     """Return overrides with some replaced or added."""
     keys = {text.partition("=")[0] for text in others}
-    return [*(text for text in overrides if text.partition("=")[0].lstrip("+") not in keys), *others]
+    return [*(text for text in overrides if text.partition("=")[0] not in keys), *others]
 
 
 def command_line(*arguments: str) -> str:

@@ -4,8 +4,6 @@ from collections.abc import Mapping, Sequence
 from math import isfinite
 from pathlib import Path
 
-from rich.table import Table
-
 from atlantis_exp import terminal
 from atlantis_exp.documents import Report, Reported
 from atlantis_exp.runs.folder import EVALUATED, TABLE_COLUMNS, RunFolder, all_runs, fits
@@ -29,9 +27,7 @@ def report(outputs: Path, runs: Sequence[str] = (), where: Sequence[str] = ()) -
         return
     shown = outputs.relative_to(Path.cwd()) if outputs.is_relative_to(Path.cwd()) else outputs
     columns = ("run", "steps", "mean", "+-", "median", "IQM", "high", "low", "random", "episodes")
-    table = Table(*columns, title=f"last evaluations of the runs in {shown}")
-    for column in table.columns[1:]:
-        column.justify = "right"
+    table = terminal.table(*columns, title=f"last evaluations of the runs in {shown}")
     for each in reported:
         earlier = f" (evaluated at {each.evaluated_at:,})" if each.evaluated_at not in (None, each.steps) else ""
         steps = f"{each.steps:,}{earlier if each.state == 'done' else f' ({each.state})'}"

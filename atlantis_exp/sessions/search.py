@@ -339,7 +339,7 @@ def _interval(scores: Sequence[float]) -> str:
 
 
 def _without(overrides: Sequence[str], *keys: str) -> list[str]:
-    return [text for text in overrides if text.lstrip("+").partition("=")[0] not in keys]
+    return [text for text in overrides if text.partition("=")[0] not in keys]
 
 
 def _values(trial: Trial | FrozenTrial) -> list[str]:

@@ -99,8 +99,8 @@ def test_titles_of_a_sweep_differ_exactly_where_what_is_trained_does(line: str) 
         assert (one.title == other.title) == is_same, (one.title, other.title)
 
 
-def test_an_override_takes_the_place_of_its_key_however_that_was_written() -> None:
-    assert replaced(["++seed=1", "+a=2", "env.id=x", "seed=3"], "seed=4", "a=5") == ["env.id=x", "seed=4", "a=5"]
+def test_an_override_takes_the_place_of_its_key() -> None:
+    assert replaced(["seed=1", "a=2", "env.id=x", "seed=3"], "seed=4", "a=5") == ["env.id=x", "seed=4", "a=5"]
 
 
 def test_a_job_of_a_sweep_is_called_what_its_sweep_calls_it_however_a_value_was_written() -> None:

@@ -267,9 +267,9 @@ def test_the_command_that_compares_is_read_as_it_is_meant(asking: Asking, tmp_pa
     contest = asking("optimizer.lr=0.001,0.002", "baseline='lr=0.001'", "delta=1234567")
     words = shlex.split(contest.comparing)[4:]
     (config,) = check("compare", CompareConfig, COMPARE.rewrite(words)).values()
-    assert config.question == contest.question
-    assert config.question.delta == 1_234_567
-    assert config.question.identity.keys() == {"by", "seeds", "error", "delta", "relative", "baseline"}
+    assert config.question(config.by) == contest.question
+    assert contest.question.delta == 1_234_567
+    assert contest.question.identity.keys() == {"by", "seeds", "error", "delta", "relative", "baseline"}
     assert config.at_epsilon == 0.05
     assert config.paths.outputs == str(tmp_path)
 
@@ -279,8 +279,8 @@ def test_a_question_about_the_training_score_is_handed_on_with_its_window(asking
     contest = asking("optimizer.lr=0.001,0.002", "score=training", "window=25%", "format=json")
     words = shlex.split(contest.comparing)[4:]
     (config,) = check("compare", CompareConfig, COMPARE.rewrite(words)).values()
-    assert config.question == contest.question
-    assert (config.question.score, config.question.window) == ("training", 0.25)
+    assert config.question(config.by) == contest.question
+    assert (contest.question.score, contest.question.window) == ("training", 0.25)
     other = asking("optimizer.lr=0.001,0.002", "score=training", "window=20%")
     assert other.folder != contest.folder
     assert asking("optimizer.lr=0.001,0.002", "window=25%").folder == asking("optimizer.lr=0.001,0.002").folder

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from atlantis_exp.build import build_emulators, build_evaluator, build_learner, make_emulator
+from atlantis_exp.build import build_evaluator, build_learner, make_emulator
 from atlantis_exp.config import Config
 from atlantis_exp.game.preprocessing import FrameStack
+from atlantis_exp.game.vector import make_emulators
 from atlantis_exp.training.actor import Actor, EpsilonGreedy, RandomActor
 from atlantis_exp.training.evaluation import Episode, Stopped, evaluate
 from atlantis_exp.training.film import Part, film_episode, moments, span
@@ -26,7 +27,7 @@ Compose = Callable[..., Config]
 def played(tiny: Compose) -> Callable[..., Episode]:
     def play(actor: Actor | None = None) -> Episode:
         env = tiny("env.max_steps=25").env
-        with build_emulators(env, 1, 1) as emulators:
+        with make_emulators(make_emulator(env), 1, 1) as emulators:
             player = actor or RandomActor(4)
             return evaluate(player, emulators, episodes=4, epsilon=0.5, seed=5, size=env.size, lags=env.lags).best
 
