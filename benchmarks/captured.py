@@ -27,7 +27,7 @@ from atlantis_exp.learning.objectives import action_values
 from atlantis_exp.learning.values import channels_last, generators_of
 from atlantis_exp.sessions.processor import set_up_torch
 from benchmarks.composition import composed
-from benchmarks.contest import calls_per_second, print_results, print_table, take_turns
+from benchmarks.contest import calls_per_second, parser_of, print_results, print_table, run, take_turns
 
 Arrays = Sequence[npt.NDArray[Any]]
 Work = Callable[[], torch.Tensor]
@@ -115,7 +115,8 @@ class Captured:
 
         def sent(array: npt.NDArray[Any]) -> torch.Tensor:
             buffer, expected = next(each)
-            np.testing.assert_array_equal(array, expected)
+            if not np.array_equal(array, expected):
+                raise ValueError("an update sends other arrays than expected")
             return buffer
 
         return sent
@@ -146,7 +147,7 @@ def _sent_by_an_update(*batch: npt.NDArray[Any]) -> Arrays:
 
 def learner_of(*overrides: str) -> tuple[Learner, Callable[[int], tuple[Any, ...]]]:
     """Return a learner whose learning rate is on the device, and a function that returns batches of noise."""
-    config = composed("experiment=fast", *overrides)
+    config = composed("experiment=fast", "threads=1", *overrides)  # else it splits batches
     set_up_torch(config, config.device)
     learner = build_learner(config)
     for group in learner.optimizer.param_groups:
@@ -183,11 +184,9 @@ def are_equal(capture: Capture, *overrides: str, updates: int = 40) -> bool:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table and the JSON line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.captured", description="updates as one CUDA graph")
+    parser = parser_of("captured", __doc__, rounds=5, seconds=2.0)
     parser.add_argument("--rehearse", action="store_true", help="make no graphs")
-    parser.add_argument("--models", nargs="+", default=["cnn", "resnet", "resnet_fast"])
-    parser.add_argument("--rounds", type=int, default=5, help="turns of each")
-    parser.add_argument("--seconds", type=float, default=2.0, help="length of a turn")
+    parser.add_argument("--models", type=lambda names: names.split(","), default="cnn,resnet,resnet_fast", help="a,b")
     parser.add_argument("overrides", nargs="*", help="of the training, as objective=double_dqn")
     args = parser.parse_args(arguments)
     if not args.rehearse and choose_device("auto").type != "cuda":
@@ -240,4 +239,4 @@ def _turn(by: Learner | Captured, batch: tuple[Any, ...], seconds: float) -> Cal
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -1,9 +1,12 @@
 """Let contestants work in turns, and print tables."""
 
+import argparse
 import json
 import multiprocessing
 import statistics
+import sys
 import time
+from argparse import ArgumentParser
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from importlib.util import find_spec
@@ -14,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from atlantis_exp import terminal
+from atlantis_exp.faults import Fault
 
 T = TypeVar("T")
 Measure = Callable[[float], T]  # of seconds to work for
@@ -64,6 +68,35 @@ def _serve(program: Callable[[], AbstractContextManager[Measure[Any]]], connecti
                 connection.send(measure(connection.recv()))
         except EOFError:
             pass
+
+
+class _Help(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter): ...
+
+
+def parser_of(name: str, doc: str | None, rounds: int | None = None, seconds: float | None = None) -> ArgumentParser:
+    """Return a benchmark's parser, with these defaults of --rounds and --seconds if it takes turns."""
+    parser = ArgumentParser(prog=f"python -m benchmarks.{name}", description=doc, formatter_class=_Help)
+    if rounds is not None:
+        parser.add_argument("--rounds", type=int, default=rounds, help="turns of each")
+    if seconds is not None:
+        parser.add_argument("--seconds", type=float, default=seconds, help="length of a turn")
+    return parser
+
+
+def run(main: Callable[[], None]) -> None:
+    """Run a benchmark; a fault, such as a wrong override, ends it with one line."""
+    try:
+        main()
+    except Fault as error:
+        terminal.warn(str(error))
+        sys.exit(error.exit_code)
+
+
+def together(contestants: Sequence[Contestant[float]], seconds: float) -> float:
+    """Let contestants work at the same time; return the sum of their rates."""
+    for contestant in contestants:
+        contestant.begin(seconds)
+    return sum([contestant.finish() for contestant in contestants])
 
 
 def take_turns(turns: Mapping[str, Callable[[], T]], rounds: int) -> dict[str, list[T]]:

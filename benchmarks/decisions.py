@@ -7,7 +7,6 @@ calls one of two groups with equal means better or worse, or two groups that dif
 standard deviations of one group.
 """
 
-import argparse
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +23,7 @@ from atlantis_exp.comparison.account import Asked, open_account, seeds_between
 from atlantis_exp.comparison.decision import Decision, Look, Plan, decide, looks_up_to, mean_interval
 from atlantis_exp.comparison.estimands import TrainingEpisodes, training_score
 from atlantis_exp.comparison.verdict import Group, Question, answer, families
-from benchmarks.contest import print_results, print_table
+from benchmarks.contest import parser_of, print_results, print_table, run
 
 Values = npt.NDArray[np.float64]
 Follow = Callable[[Values, Plan], tuple[Decision, int]]
@@ -330,7 +329,7 @@ def percent(share: float) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables and the JSON line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.decisions", description="how often verdicts are wrong")
+    parser = parser_of("decisions", __doc__)
     parser.add_argument("--simulations", type=int, default=2_000, help="comparisons in each cell")
     count = parser.parse_args(arguments).simulations
     rng = np.random.default_rng(0)
@@ -574,4 +573,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

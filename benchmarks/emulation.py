@@ -7,9 +7,7 @@ a step's last two frames. The peers have one thread a core, or two: the better o
 core, emulate frames without reading them. Each contestant has its own process and rests during the others' turns.
 """
 
-import argparse
 import functools
-import os
 import statistics
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -21,28 +19,30 @@ from ale_py.roms import get_rom_path
 
 from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.vector import make_emulators
+from atlantis_exp.machine import here
 from benchmarks.contest import (
     Contestant,
     Measure,
     calls_per_second,
     medians,
     missing,
+    parser_of,
     print_rates,
     print_results,
     ratio,
+    run,
     take_turns,
+    together,
 )
 
 Program = Callable[[], AbstractContextManager[Measure[float]]]
-
-_CORES = len(os.sched_getaffinity(0))
 
 
 @contextmanager
 def ours(num_envs: int, make: Callable[[], Emulator]) -> Iterator[Measure[float]]:
     """Our emulators, several of them in worker processes."""
     rng = np.random.default_rng(0)
-    with make_emulators(make, num_envs, _CORES) as emulators:
+    with make_emulators(make, num_envs, here().cores) as emulators:
         emulators.reset(range(num_envs), list(range(num_envs)))
 
         def step() -> None:
@@ -114,10 +114,8 @@ def bare() -> Iterator[Measure[float]]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table and the JSON line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.emulation", description="emulation speed")
+    parser = parser_of("emulation", __doc__, rounds=5, seconds=5.0)
     parser.add_argument("--num-envs", type=int, default=16)
-    parser.add_argument("--rounds", type=int, default=5, help="turns of each contestant")
-    parser.add_argument("--seconds", type=float, default=5.0, help="length of a turn")
     args = parser.parse_args(arguments)
 
     # Here, since no contestant needs torch.
@@ -133,27 +131,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "ours, report's crop, 84x84": functools.partial(ours, args.num_envs, cropped_84),
         "ours, report's crop, 159x159": functools.partial(ours, args.num_envs, cropped_159),
     }
-    for threads in (_CORES, 2 * _CORES):
+    for threads in (here().cores, 2 * here().cores):
         programs[f"AtariVectorEnv, {threads} threads"] = functools.partial(atari_vector, args.num_envs, threads)
     if not missing("envpool"):
-        for threads in (_CORES, 2 * _CORES):
+        for threads in (here().cores, 2 * here().cores):
             programs[f"EnvPool, {threads} threads"] = functools.partial(envpool, args.num_envs, threads)
 
     with ExitStack() as stack:
         turns: dict[str, Callable[[], float]] = {}
         for name, program in programs.items():
             turns[name] = functools.partial(stack.enter_context(Contestant(program)).measure, args.seconds)
-        emulators = [stack.enter_context(Contestant(bare)) for _ in range(_CORES)]
-
-        def all_bare() -> float:
-            for emulator in emulators:
-                emulator.begin(args.seconds)
-            return sum(emulator.finish() for emulator in emulators)
-
-        turns[f"bare emulators, {_CORES} processes"] = all_bare
+        emulators = [stack.enter_context(Contestant(bare)) for _ in range(here().cores)]
+        turns[f"bare emulators, {here().cores} processes"] = functools.partial(together, emulators, args.seconds)
         rates = take_turns(turns, args.rounds)
 
-    print_rates(f"steps a second, {args.num_envs} environments, {_CORES} cores", "steps/s", rates)
+    print_rates(f"steps a second, {args.num_envs} environments, {here().cores} cores", "steps/s", rates)
 
     def best(name: str) -> list[float] | None:
         return max((rates[key] for key in rates if key.startswith(name)), key=statistics.median, default=None)
@@ -177,4 +169,4 @@ def _play(env: Any, num_envs: int, dtype: type[np.signedinteger[Any]]) -> Measur
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -6,7 +6,6 @@ of bare emulators, an independent process a core, and with the states a second o
 their own processes. `film_seconds` is the processor time of a film of a whole game from its seed, actions and values.
 """
 
-import argparse
 import functools
 import os
 import statistics
@@ -30,11 +29,20 @@ from atlantis_exp.training.evaluation import Stopped
 from atlantis_exp.training.evaluator import Evaluator
 from atlantis_exp.training.film import film_episode
 from atlantis_exp.training.progress import Progress
-from benchmarks.contest import Contestant, Measure, calls_per_second, print_rates, print_results, take_turns
+from benchmarks.contest import (
+    Contestant,
+    Measure,
+    calls_per_second,
+    parser_of,
+    print_rates,
+    print_results,
+    run,
+    take_turns,
+    together,
+)
 
 Program = Callable[[str, int], AbstractContextManager[Measure[float]]]  # of a folder of weights and a number of games
 
-_CORES = len(os.sched_getaffinity(0))
 _WARM_STEPS = 40  # of half the games
 _QUIET = Progress(Console(quiet=True))
 
@@ -93,17 +101,10 @@ def passing(folder: str, num_envs: int) -> Iterator[Measure[float]]:
     yield lambda seconds: num_envs * calls_per_second(call, seconds)
 
 
-def _together(contestants: Sequence[Contestant[float]], seconds: float) -> float:
-    """Let contestants work at the same time; return the sum of their rates."""
-    for contestant in contestants:
-        contestant.begin(seconds)
-    return sum(contestant.finish() for contestant in contestants)
-
-
 def film_seconds(folder: str, steps: int) -> tuple[float, int]:
     """Return the processor time of a film of one game, without playing it, and the film's bytes."""
     actor, evaluator = player(folder, 1, steps)
-    (episode,) = evaluator(actor, 1, _QUIET).episodes
+    (episode,) = evaluator(actor, 1, Progress()).episodes
     before = os.times()
     video = film_episode(episode, evaluator.make_emulator(), "all")
     after = os.times()
@@ -112,11 +113,9 @@ def film_seconds(folder: str, steps: int) -> tuple[float, int]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table and the JSON line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.evaluation")
+    parser = parser_of("evaluation", __doc__, rounds=5, seconds=5.0)
     parser.add_argument("--weights", default="pretrained/cnn_fast", help="a folder of exported weights")
     parser.add_argument("--num-envs", type=int, default=50, help="games at once")
-    parser.add_argument("--rounds", type=int, default=5, help="turns of each part")
-    parser.add_argument("--seconds", type=float, default=5.0, help="length of a turn")
     parser.add_argument("--film-steps", type=int, default=27_000, help="of the filmed game")
     args = parser.parse_args(arguments)
     minutes = (
@@ -129,10 +128,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             return stack.enter_context(Contestant(functools.partial(program, args.weights, games)))
 
         whole, batch = contestant(evaluating, args.num_envs), contestant(passing, args.num_envs)
-        cores = [contestant(emulating, -(-args.num_envs // _CORES)) for _ in range(_CORES)]
+        cores = [contestant(emulating, -(-args.num_envs // here().cores)) for _ in range(here().cores)]
         turns = {
             "evaluation": functools.partial(whole.measure, args.seconds),
-            "emulators alone": functools.partial(_together, cores, args.seconds),
+            "emulators alone": functools.partial(together, cores, args.seconds),
             "network alone": functools.partial(batch.measure, args.seconds),
         }
         rates = take_turns(turns, args.rounds)
@@ -148,4 +147,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -9,7 +9,6 @@ package, since the import takes longer than all else. The last training is a job
 as by a person, and killed with all its processes.
 """
 
-import argparse
 import itertools
 import math
 import multiprocessing
@@ -36,7 +35,7 @@ from atlantis_exp.sessions.contracts import fingerprints
 from atlantis_exp.sessions.job import replaced
 from atlantis_exp.sessions.page import terminable
 from benchmarks.composition import composed
-from benchmarks.contest import print_results, print_table
+from benchmarks.contest import parser_of, print_results, print_table, run
 
 SMALL = (
     *("experiment=quick", "device=cpu", "threads=1", "budget.forecast=off"),
@@ -60,7 +59,7 @@ _FORKS = multiprocessing.get_context("forkserver")
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Kill, compare and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.kills")
+    parser = parser_of("kills", __doc__)
     parser.add_argument("--kills", type=int, default=1_000)
     parser.add_argument("--only", choices=[*TRAININGS, SWEEP], action="append", help="sweep is one on joblib")
     parser.add_argument("--early", type=float, default=0.0, help="share of the kills while a session starts")
@@ -70,7 +69,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     console = Console(stderr=True, highlight=False)
     differences: list[str] = []
     struck = dict.fromkeys(names, 0)
-    with tempfile.TemporaryDirectory() as folder:
+    folder = tempfile.mkdtemp(prefix="kills-")
+    try:
         console.print(f"some {options.kills * 5 / 60:,.0f} minutes on two cores; first each training unbroken")
         unbroken = {}
         for name in names:
@@ -88,11 +88,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
             parts = sorted({part for part, _ in prints.items() ^ unbroken[name].items()})
             differences += [f"{name}, copy {copy}: {part}" for part in parts]
             if parts:
-                console.print(f"DIFFERENT in {', '.join(parts)}: kept in {place} until this ends")
+                console.print(f"DIFFERENT in {', '.join(parts)}: kept in {place}")
             else:
                 shutil.rmtree(place)
+    finally:
+        if not differences:
+            shutil.rmtree(folder)
     print_table("kills", ("training", "kills"), [(name, f"{kills:,}") for name, kills in struck.items()])
     print_results({"kills": sum(struck.values()), "differences": differences})
+    if differences:
+        sys.exit(1)
 
 
 def _so_far(outputs: Path) -> str:
@@ -231,4 +236,4 @@ def _train(words: Sequence[str], said: Path, ready: "multiprocessing.connection.
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -8,7 +8,6 @@ matrices in the same format, right before it in the same process.
 `--against OVERRIDE...` also measures the same updates with these overrides: `compile=true`, `training.ema=2000`.
 """
 
-import argparse
 import statistics
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -19,10 +18,9 @@ import torch
 from atlantis_exp import terminal
 from atlantis_exp.build import build_learner, choose_device, choose_precision
 from atlantis_exp.config import Config
-from atlantis_exp.faults import ConfigError
 from atlantis_exp.sessions.processor import set_up_torch
 from benchmarks.composition import composed
-from benchmarks.contest import calls_per_second, print_results, print_table, take_turns
+from benchmarks.contest import calls_per_second, parser_of, print_results, print_table, run, take_turns
 
 _SIDE = 2_048  # of the square matrices; larger ones were no faster
 
@@ -97,17 +95,12 @@ def chosen(names: Sequence[str] | None) -> list[Case]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table and the JSON line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.learner", description="the learner's FLOP rate")
-    parser.add_argument("--cases", nargs="*", choices=[case.name for case in CASES], default=None)
+    parser = parser_of("learner", __doc__, rounds=7, seconds=2.0)
+    parser.add_argument("--cases", nargs="+", choices=[case.name for case in CASES], default=None)
     parser.add_argument("--against", nargs="+", metavar="OVERRIDE", default=(), help="updates to compare with these")
-    parser.add_argument("--rounds", type=int, default=7, help="turns of each case")
-    parser.add_argument("--seconds", type=float, default=2.0, help="length of a turn")
     args = parser.parse_args(arguments)
     cases = chosen(args.cases)
-    try:
-        others = {case: case.config(*args.against) for case in cases if args.against}
-    except ConfigError as error:
-        parser.error(str(error))
+    others = {case: case.config(*args.against) for case in cases if args.against}
 
     threads = torch.get_num_threads()
     turns: dict[str, Callable[[], float]] = {}
@@ -172,4 +165,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -8,7 +8,6 @@ they write, and the processor time of the mirroring thread. Once a turn it times
 config.
 """
 
-import argparse
 import functools
 import statistics
 import threading
@@ -27,7 +26,7 @@ from atlantis_exp.tracking.store import Store
 from atlantis_exp.training.evaluation import Episode, Evaluation
 from atlantis_exp.training.trainer import Trainer
 from benchmarks.composition import composed
-from benchmarks.contest import Contestant, Measure, paired_ratio, print_results, print_table, take_turns
+from benchmarks.contest import Contestant, Measure, paired_ratio, parser_of, print_results, print_table, run, take_turns
 from benchmarks.training import batch_of, learning, steps_per_second, training_config
 
 _NUM_ENVS = 16
@@ -124,9 +123,7 @@ def evaluation_seconds(trainer: Trainer) -> float:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table and the JSON line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.overhead", description="the cost of tracking")
-    parser.add_argument("--rounds", type=int, default=5, help="turns of each training")
-    parser.add_argument("--seconds", type=float, default=30.0, help="length of a turn")
+    parser = parser_of("overhead", __doc__, rounds=5, seconds=30.0)
     parser.add_argument("--commit-seconds", type=float, default=10.0, help="time between two commits")
     args = parser.parse_args(arguments)
 
@@ -188,4 +185,4 @@ def _evaluation() -> Evaluation:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

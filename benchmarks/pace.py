@@ -7,7 +7,6 @@ the top lane and come back a lane lower until they are hit. A gap leads from a h
 ship to the next one of its wave are those that `python -m benchmarks.schedule` chooses from.
 """
 
-import argparse
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -27,7 +26,7 @@ from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.vector import SerialEmulators
 from atlantis_exp.training.actor import PersonActor
 from atlantis_exp.training.progress import Progress
-from benchmarks.contest import print_results, print_table
+from benchmarks.contest import parser_of, print_results, print_table, run
 from benchmarks.evaluation import player
 from benchmarks.schedule import TICK
 
@@ -100,7 +99,7 @@ def spacings(frames: Sequence[int], to_come: Sequence[tuple[int, int]]) -> dict[
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the games in words and as a JSON line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.pace")
+    parser = parser_of("pace", __doc__)
     parser.add_argument("--weights", default="pretrained/cnn_annealed", help="a folder of exported weights")
     parser.add_argument("--oracle", action="store_true", help="look ahead instead, in the game of the weights")
     parser.add_argument("--epsilon", type=float, help="1: random play; default: the card's; the oracle ignores it")
@@ -163,4 +162,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -6,7 +6,6 @@ update that it feeds take turns in one process. Stable-Baselines3's buffer is as
 tells the size of any.
 """
 
-import argparse
 import functools
 import itertools
 import multiprocessing
@@ -26,7 +25,7 @@ from atlantis_exp.replay.memory import ReplayMemory, Returns
 from atlantis_exp.replay.samplers import UniformSampler
 from atlantis_exp.sessions.processor import set_up_torch
 from benchmarks.composition import composed
-from benchmarks.contest import calls_per_second, missing, print_results, print_table, take_turns
+from benchmarks.contest import calls_per_second, missing, parser_of, print_results, print_table, run, take_turns
 
 _SB3_TRANSITIONS = 5_000
 
@@ -137,7 +136,7 @@ def measure_share(model: str, steps: int, transitions: int, rounds: int, seconds
             "sample": functools.partial(
                 calls_per_second, lambda: memory.gather(memory.draw(BATCHES[model], rng), RETURNS), seconds
             ),
-            "update": functools.partial(calls_per_second, lambda: learner.update(*batch), seconds),
+            "update": functools.partial(calls_per_second, lambda: learner.update(*batch).cpu(), seconds),
         },
         rounds,
     )
@@ -170,13 +169,11 @@ def measure_sb3(size: int, batch_size: int, *, optimized: bool) -> tuple[float, 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables and the JSON line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.replay", description="memory and sampling cost")
+    parser = parser_of("replay", __doc__, rounds=7, seconds=1.0)
     names = [case.name for case in CASES]
     parser.add_argument("--cases", nargs="*", choices=names, default=names, help="rows of the first table")
     parser.add_argument("--steps", type=int, default=20_000, help="steps of play to record for each size")
     parser.add_argument("--transitions", type=int, default=1_000_000, help="transitions to fill the memory with")
-    parser.add_argument("--rounds", type=int, default=7, help="turns of sampling and of updating")
-    parser.add_argument("--seconds", type=float, default=1.0, help="length of a turn")
     args = parser.parse_args(arguments)
     results: dict[str, Any] = {}
     rows: list[tuple[str, ...]] = []
@@ -242,4 +239,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -7,14 +7,13 @@ in every game: the ships of all ticks are known beforehand, and a player chooses
 side gun hits each ship and no building is lost.
 """
 
-import argparse
 import sys
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.contest import print_results, print_table
+from benchmarks.contest import parser_of, print_results, print_table, run
 
 TICK, FIRST_TICK = 32, 24  # frames
 _REGISTER = 0x6977  # before the first frame: 15 bits, 0xc6 and 0xc5 of the console's memory
@@ -65,7 +64,7 @@ def most_points(draws: npt.NDArray[np.bool_], gaps: Gaps) -> float:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the bounds as a table and as a JSON line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.schedule")
+    parser = parser_of("schedule", __doc__)
     parser.add_argument("--frames", type=int, default=108_000, help="of a game")
     args = parser.parse_args(arguments)
     print("about ten seconds", file=sys.stderr, flush=True)
@@ -77,4 +76,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

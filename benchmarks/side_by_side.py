@@ -4,7 +4,6 @@ One training on all cores takes turns with several at a time, as many and with a
 choose here. Evaluations are left out. Seeds an hour are proportional to steps a second, summed over the trainings.
 """
 
-import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -13,7 +12,17 @@ from atlantis_exp.machine import here
 from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.launchers.joblib import fitting
 from benchmarks.composition import composed
-from benchmarks.contest import Contestant, Measure, paired_ratio, print_rates, print_results, take_turns
+from benchmarks.contest import (
+    Contestant,
+    Measure,
+    paired_ratio,
+    parser_of,
+    print_rates,
+    print_results,
+    run,
+    take_turns,
+    together,
+)
 from benchmarks.training import learning, steps_per_second
 
 _WORK = (  # experiment=fast in mid-training
@@ -29,19 +38,10 @@ def training(cores: int, overrides: Sequence[str]) -> Iterator[Measure[float]]:
         yield partial(steps_per_second, trainer)
 
 
-def together(contestants: Sequence[Contestant[float]], seconds: float) -> float:
-    """Let contestants work at the same time; return the sum of their steps a second."""
-    for contestant in contestants:
-        contestant.begin(seconds)
-    return sum([contestant.finish() for contestant in contestants])
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table and the JSON line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.side_by_side", description="seeds an hour")
+    parser = parser_of("side_by_side", __doc__, rounds=3, seconds=20.0)
     parser.add_argument("--seeds", type=int, default=10, help="trainings there are to do")
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=20.0, help="length of a turn")
     parser.add_argument("overrides", nargs="*", help="of the training, as model=resnet")
     args = parser.parse_args(arguments)
     settings = fitting([Job(composed(*_WORK, *args.overrides))], args.seeds).settings
@@ -61,4 +61,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

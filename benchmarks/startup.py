@@ -5,7 +5,6 @@ printed config, a misspelt key, `report` and `compare` of twelve runs, and `eval
 The commands take turns; shares are medians over rounds. Install all extras first, since Hydra searches for plugins.
 """
 
-import argparse
 import os
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from collections.abc import Sequence
 from functools import partial
 
 from atlantis_exp.commands import CHECKOUT
-from benchmarks.contest import paired_ratio, print_results, print_table, take_turns
+from benchmarks.contest import paired_ratio, parser_of, print_results, print_table, run, take_turns
 
 TARGETS = {"help": 0.25, "cfg": 0.25, "bad_input": 0.25, "report": 0.6, "evaluate": 1.5, "compare": 2.0}
 
@@ -40,8 +39,7 @@ commands.main()
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Start, measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.startup")
-    parser.add_argument("--rounds", type=int, default=5)
+    parser = parser_of("startup", __doc__, rounds=5)
     options = parser.parse_args(arguments)
     print(f"twelve small runs: a minute; {options.rounds} rounds: half a minute each", file=sys.stderr, flush=True)
     with tempfile.TemporaryDirectory() as folder:
@@ -79,4 +77,4 @@ def _seconds(*arguments: str) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

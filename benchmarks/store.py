@@ -1,13 +1,12 @@
 """Measure commands over many long runs: compare, a sweep's table, report, sync: `python -m benchmarks.store`."""
 
-import argparse
 import dataclasses
 import json
 import os
 import shutil
-import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -30,6 +29,7 @@ from atlantis_exp.tracking.mirror import PRIMARY, Cursor, digest
 from atlantis_exp.tracking.store import Store
 from atlantis_exp.training.evaluation import Episode, Evaluation
 from benchmarks.composition import composed
+from benchmarks.contest import parser_of, run
 
 STEPS_PER_EPISODE = 1_600  # of random play; every 1,000 steps a journal has a line of 17 metrics
 MODELS = ("cnn", "resnet")
@@ -136,6 +136,8 @@ def measure(command: Callable[[], object]) -> tuple[float, float, float]:
         try:
             command()
             status = 0
+        except BaseException:
+            traceback.print_exc()
         finally:
             os._exit(status)
     _, status, usage = os.wait4(child, 0)
@@ -158,9 +160,9 @@ def measure_publishing(runs: Path, outputs: Path) -> None:
     print(json.dumps({"runs": len(copies), "sync_s": round(seconds, 2), "processor_s": round(processor, 2)}))
 
 
-def main(arguments: Sequence[str] = ()) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Write the runs, measure the commands and print a table and one line of JSON."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.store", description=__doc__)
+    parser = parser_of("store", __doc__)
     parser.add_argument("--runs", type=int, default=1_000)
     parser.add_argument("--episodes", type=int, default=20_000)
     parser.add_argument("--distinct", type=int, default=20, help="journals; the other runs link to them")
@@ -199,4 +201,4 @@ def main(arguments: Sequence[str] = ()) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run(main)

@@ -8,7 +8,6 @@ network plays a few games at the same epsilon, off the clock. All train and play
 cut after --cut steps, so marked scores are lower bounds.
 """
 
-import argparse
 import functools
 import itertools
 import math
@@ -33,7 +32,7 @@ from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.training.actor import EpsilonGreedy, States
 from atlantis_exp.training.progress import Progress
 from benchmarks.composition import composed
-from benchmarks.contest import Contestant, Measure, missing, print_results, print_table, take_turns
+from benchmarks.contest import Contestant, Measure, missing, parser_of, print_results, print_table, run, take_turns
 
 GAME = ("env=atlantis_standard", "env.sticky=0", "env.noop_max=30")  # AtlantisNoFrameskip-v4 in SB3's AtariWrapper
 GOALS = (25_240, 62_500)  # the report's best mean, and its best game
@@ -104,8 +103,10 @@ def stable_baselines3(judge: Judge, make: Callable[[Any], Any]) -> Iterator[Meas
 
     def q_values(states: States) -> npt.NDArray[np.float32]:
         with torch.no_grad():
-            q = network(torch.from_numpy(states))  # scales bytes itself; (B, A), or quantiles (B, N, A)
-        values: npt.NDArray[np.float32] = (q if q.ndim == 2 else q.mean(1)).numpy()
+            q = network(
+                torch.from_numpy(states).to(model.device)
+            )  # scales bytes itself; (B, A), or quantiles (B, N, A)
+        values: npt.NDArray[np.float32] = (q if q.ndim == 2 else q.mean(1)).cpu().numpy()
         return values
 
     def measure(seconds: float) -> Turn:
@@ -199,7 +200,7 @@ def sooner(goal: float, turns: dict[str, list[Turn]]) -> tuple[float, bool] | No
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train in turns and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.time_to_score")
+    parser = parser_of("time_to_score", __doc__)
     parser.add_argument("--contestants", nargs="*", choices=PROGRAMS, default=list(PROGRAMS))
     parser.add_argument("--minutes", type=float, default=6.0, help="training of each; for a result: 180")
     parser.add_argument("--turn", type=float, default=2.0, help="minutes of a turn; for a result: 10")
@@ -240,4 +241,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

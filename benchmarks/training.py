@@ -7,7 +7,6 @@ measured, and rests during the others' turns. Stable-Baselines3 has Gymnasium's 
 of several environments, and `optimize_memory_usage`.
 """
 
-import argparse
 import functools
 import subprocess
 import sys
@@ -35,9 +34,11 @@ from benchmarks.contest import (
     medians,
     missing,
     paired_ratio,
+    parser_of,
     print_rates,
     print_results,
     ratio,
+    run,
     take_turns,
 )
 from benchmarks.replay import fill, random_play
@@ -209,12 +210,10 @@ def contest(programs: dict[str, Program], rounds: int, seconds: float, busy: int
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables and the JSON line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.training", description="training speed")
+    parser = parser_of("training", __doc__, rounds=5, seconds=10.0)
     parser.add_argument("--contestants", nargs="*", choices=CONTESTANTS, default=list(CONTESTANTS))
     parser.add_argument("--num-envs", nargs="*", type=int, default=[1, 4, 8, 16, 32])
     parser.add_argument("--fills", nargs="*", type=int, default=[10_000, 100_000, 1_000_000], help="transitions")
-    parser.add_argument("--rounds", type=int, default=5, help="turns of each contestant")
-    parser.add_argument("--seconds", type=float, default=10.0, help="length of a turn")
     parser.add_argument("--neighbours", type=int, default=0, help="other programs that want a core each")
     parser.add_argument("--play-steps", type=int, default=20_000, help="random play that the fills repeat")
     args = parser.parse_args(arguments)
@@ -264,4 +263,4 @@ def _gymnasium_game(seed: int) -> Any:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -5,7 +5,6 @@ folders OUTPUTS to the data, replacing runs of the same names.
 """
 
 import csv
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import matplotlib
 import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
-from tables import RANDOM, Row, updated
+from tables import RANDOM, Row, arguments, updated
 
 from atlantis_exp.media import GREY
 from atlantis_exp.runs.folder import RunFolder, all_runs, evaluation_at
@@ -114,4 +113,4 @@ def draw(ladder: Sequence[Row], branches: Sequence[Row]) -> None:
 
 
 if __name__ == "__main__":
-    main([Path(argument) for argument in sys.argv[1:]])
+    main(arguments(__doc__).outputs)

@@ -4,7 +4,6 @@
 folders OUTPUTS to the table, replacing runs of the same names.
 """
 
-import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from itertools import cycle, groupby
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from tables import RANDOM, updated
+from tables import RANDOM, arguments, updated
 
 from atlantis_exp.comparison.figures import thousands
 from atlantis_exp.media import GREY, run_colour
@@ -85,4 +84,4 @@ def rows_of(run: RunFolder) -> Iterator[list[str]]:
 
 
 if __name__ == "__main__":
-    main([Path(argument) for argument in sys.argv[1:]])
+    main(arguments(__doc__).outputs)

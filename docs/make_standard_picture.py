@@ -5,13 +5,13 @@
 names.
 """
 
-import sys
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 
 from make_results_picture import columns, rows_with
 from matplotlib.figure import Figure
+from tables import arguments
 
 from atlantis_exp.comparison.figures import thousands
 from atlantis_exp.comparison.published import curves
@@ -54,4 +54,5 @@ def main(name: str, outputs: Sequence[Path]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], [Path(folder) for folder in sys.argv[2:]])
+    asked = arguments(__doc__, TRAINED)
+    main(asked.name, asked.outputs)

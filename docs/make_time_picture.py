@@ -6,13 +6,13 @@ of `python -m benchmarks.time_to_score`, whose curves then replace the table.
 
 import csv
 import json
-import sys
 from collections.abc import Sequence
 from itertools import accumulate, groupby
 from pathlib import Path
 
 from make_results_picture import columns
 from matplotlib.figure import Figure
+from tables import arguments
 
 from atlantis_exp.comparison.figures import thousands
 from atlantis_exp.media import BLUE, GREEN, GREY, VERMILLION
@@ -64,4 +64,5 @@ def main(name: str, outputs: Sequence[Path]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], [Path(output) for output in sys.argv[2:]])
+    asked = arguments(__doc__, ("time_to_score", "time_to_score_longer"))
+    main(asked.name, asked.outputs)

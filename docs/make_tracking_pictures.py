@@ -15,7 +15,7 @@ from pathlib import Path
 from playwright.sync_api import Page, sync_playwright
 
 from atlantis_exp.tracking.store import Store
-from atlantis_exp.tracking.views import COMPARISONS, START, SWEEP, address
+from atlantis_exp.tracking.views import COMPARISONS, START, address
 
 IMAGES = Path(__file__).parent / "images"
 SECONDS = 8  # until a page's charts are drawn
@@ -40,7 +40,7 @@ def main() -> None:
     server = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
     store, root = Store(outputs), f"http://127.0.0.1:{port}"
     kinds = {run.data.tags["atlantis.kind"]: run.info.run_id for run in store.runs()}
-    places = {view: address(root, store.experiment_id, view) for view in (START, SWEEP, COMPARISONS)}
+    places = {view: address(root, store.experiment_id, view) for view in (START, COMPARISONS)}
     runs = places[START].partition("?")[0]
     try:
         while server.poll() is None:
@@ -50,15 +50,10 @@ def main() -> None:
             time.sleep(0.5)
         with sync_playwright() as started:
             browser = started.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
-            for width, height, ending in ((1440, 900, ""), (390, 844, "_phone")):
-                context = browser.new_context(viewport={"width": width, "height": height})
-                page = context.new_page()
-                take(page, places[START], f"start{ending}")
-                if not ending:
-                    take(page, places[SWEEP], "groups")
-                    take(page, places[COMPARISONS], "comparisons")
-                    take(page, f"{runs}/{kinds['training']}", "run")
-                    take(page, f"{runs}/{kinds['training sweep']}", "sweep")
+            page = browser.new_page(viewport={"width": 1440, "height": 900})
+            take(page, places[START], "start")
+            take(page, places[COMPARISONS], "comparisons")
+            take(page, f"{runs}/{kinds['training']}", "run")
             browser.close()
     finally:
         os.killpg(server.pid, signal.SIGKILL)

@@ -1,5 +1,6 @@
-"""Update the tables in docs/data, for the scripts beside it."""
+"""Update the tables in docs/data, and read the arguments of the scripts beside it."""
 
+import argparse
 import csv
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
@@ -7,6 +8,21 @@ from pathlib import Path
 RANDOM = 20_873  # a random player's mean (docs/reproduction.md)
 
 Row = dict[str, str]
+
+
+def arguments(doc: str | None, names: Collection[str] = ()) -> argparse.Namespace:
+    """Parse a script's arguments: `name`, one of `names` if there are any, and `outputs`, folders or files."""
+
+    def existing(text: str) -> Path:
+        if not (path := Path(text)).exists():
+            raise argparse.ArgumentTypeError(f"{text}: no such file or folder")
+        return path
+
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    if names:
+        parser.add_argument("name", choices=names)
+    parser.add_argument("outputs", nargs="*", type=existing, help="what new rows come from; none: draw the table again")
+    return parser.parse_args()
 
 
 def updated(

@@ -5,8 +5,8 @@ without a look. It keeps a point of a training's curve every 5,000 steps, with f
 steps. Each folder beside this file is such a target.
 """
 
+import argparse
 import json
-import sys
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -36,11 +36,13 @@ def main(outputs: Path, target: Path) -> None:
 
 def keep(run: RunFolder, names: Sequence[str], target: Path, steps: int = 0) -> None:
     """Copy a folder, name its outputs folder `outputs`, and detach it from its sweep."""
-    place = bytes(run.path.parents[1].absolute())
+    places = sorted({bytes(run.path.parents[1].absolute()), bytes(run.path.parents[1].resolve())}, key=len)
     target = target / run.path.parent.name / run.name
 
     def without_place(content: bytes) -> bytes:
-        return content.replace(place, b"outputs")
+        for place in reversed(places):
+            content = content.replace(place, b"outputs")
+        return content
 
     commit = run.commit
     assert commit is not None
@@ -91,4 +93,10 @@ def shortened(record: dict[str, Any]) -> bytes:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("outputs", type=Path)
+    parser.add_argument("target", type=Path)
+    asked = parser.parse_args()
+    if not (asked.outputs / "runs").is_dir():
+        parser.error(f"{asked.outputs}: has no runs")
+    main(asked.outputs, asked.target)

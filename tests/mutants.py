@@ -237,29 +237,38 @@ def killed_of(module: str, sample: int, seed: int, folder: Path) -> dict[str, An
     waiting: list[Mutant | None] = [*latest_first, None]  # the original first
     running: dict[int, tuple[Mutant | None, float, Path]] = {}
     survivors: list[str] = []
-    while waiting or running:
-        if waiting and len(running) < (os.cpu_count() or 1) and not any(each[0] is None for each in running.values()):
-            mutant = waiting.pop()
-            lines = range(mutant.first, mutant.last + 1) if mutant else ()
-            tests = [test for test in by_cost if any(line in lines for line in watch.called[test])] or by_cost
-            own = Path(tempfile.mkdtemp(dir=folder))
-            if (child := apart(own / "log")) == 0:
-                run_mutated(f"atlantis_exp.{module}", tree, mutant, tests, own / "base")
-            running[child] = mutant, time.monotonic() + 20 + 5 * sum(watch.seconds[test] for test in tests), own
-            continue
-        child, status = os.waitpid(-1, os.WNOHANG)
-        if not child:
-            for late in [pid for pid, (_, deadline, _) in running.items() if time.monotonic() > deadline]:
-                os.killpg(late, signal.SIGKILL)
-            time.sleep(0.02)
-            continue
-        mutant, _, own = running.pop(child)
-        if mutant is None and status:
-            sys.exit(f"the tests fail on the original:\n{(own / 'log').read_text()[-2_000:]}")
-        if mutant is not None:
-            print(f"{'killed  ' if status else 'SURVIVED'} {module}:{mutant.line}  {mutant.change}", flush=True)
-            survivors += [] if status else [f"{mutant.line}: {mutant.change}"]
-        shutil.rmtree(own, ignore_errors=True)
+    try:
+        while waiting or running:
+            if (
+                waiting
+                and len(running) < (os.cpu_count() or 1)
+                and not any(each[0] is None for each in running.values())
+            ):
+                mutant = waiting.pop()
+                lines = range(mutant.first, mutant.last + 1) if mutant else ()
+                tests = [test for test in by_cost if any(line in lines for line in watch.called[test])] or by_cost
+                own = Path(tempfile.mkdtemp(dir=folder))
+                if (child := apart(own / "log")) == 0:
+                    run_mutated(f"atlantis_exp.{module}", tree, mutant, tests, own / "base")
+                running[child] = mutant, time.monotonic() + 20 + 5 * sum(watch.seconds[test] for test in tests), own
+                continue
+            child, status = os.waitpid(-1, os.WNOHANG)
+            if not child:
+                for late in [pid for pid, (_, deadline, _) in running.items() if time.monotonic() > deadline]:
+                    os.killpg(late, signal.SIGKILL)
+                time.sleep(0.02)
+                continue
+            mutant, _, own = running.pop(child)
+            if mutant is None and status:
+                sys.exit(f"the tests fail on the original:\n{(own / 'log').read_text()[-2_000:]}")
+            if mutant is not None:
+                print(f"{'killed  ' if status else 'SURVIVED'} {module}:{mutant.line}  {mutant.change}", flush=True)
+                survivors += [] if status else [f"{mutant.line}: {mutant.change}"]
+            shutil.rmtree(own, ignore_errors=True)
+    finally:
+        for child in running:
+            with suppress(ProcessLookupError):  # it does not lead its group yet
+                os.killpg(child, signal.SIGKILL)
     share = 1 - len(survivors) / max(len(chosen), 1)
     return {"module": module, "of": len(mutants), "run": len(chosen), "killed": round(share, 3), "survivors": survivors}
 

@@ -18,6 +18,7 @@ from atlantis_exp.build import make_emulator
 from atlantis_exp.sessions.cards import read_card
 from benchmarks import (
     captured,
+    contest,
     emulation,
     evaluation,
     kills,
@@ -155,7 +156,7 @@ def test_bfloat16_is_measured_where_it_is_faster_or_asked_for(
 
 def test_a_mistaken_override_of_a_learner_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
-        learner.main(["--against", "traning.ema=10"])
+        contest.run(lambda: learner.main(["--against", "traning.ema=10"]))
     assert "did you mean 'training.ema'?" in capsys.readouterr().err
 
 
