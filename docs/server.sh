@@ -10,18 +10,22 @@ set -euo pipefail
 umask 077
 folder=${1:?FOLDER: where files and secrets are to be} port=${2:-5000}
 : "${ATLANTIS_DATABASE:?the address of a PostgreSQL database, as in postgresql+psycopg2://USER:PASSWORD@HOST/DATABASE}"
+python=$(command -v "${PYTHON:-python}") || { echo "${PYTHON:-python}: not found" >&2; exit 2; }
+python=$(cd "$(dirname "$python")" && pwd)/$(basename "$python")
 mkdir -p "$folder/artifacts"
 cd "$folder"
 
 if [ ! -e secrets ]; then
     random() { od -An -N24 -tx1 /dev/urandom | tr -d ' \n'; }
     {
-        echo "MLFLOW_AUTH_ADMIN_PASSWORD=${MLFLOW_AUTH_ADMIN_PASSWORD:-$(random)}"
-        echo "MLFLOW_FLASK_SERVER_SECRET_KEY=${MLFLOW_FLASK_SERVER_SECRET_KEY:-$(random)}"
+        printf 'MLFLOW_AUTH_ADMIN_PASSWORD=%q\n' "${MLFLOW_AUTH_ADMIN_PASSWORD:-$(random)}"
+        printf 'MLFLOW_FLASK_SERVER_SECRET_KEY=%q\n' "${MLFLOW_FLASK_SERVER_SECRET_KEY:-$(random)}"
     } > secrets.aside
     mv secrets.aside secrets
 fi
-while IFS='=' read -r name value; do export "$name=$value"; done < secrets
+given=${MLFLOW_AUTH_ADMIN_PASSWORD-}
+set -a; . ./secrets; set +a
+[ -z "$given" ] || [ "$given" = "$MLFLOW_AUTH_ADMIN_PASSWORD" ] || echo "the password of $PWD/secrets counts" >&2
 
 # Whoever has an account may write runs; a checked password is believed for a minute, since checking one takes 0.2 s.
 # A % is doubled as the file's format wants it.
@@ -35,5 +39,5 @@ EOF
 export MLFLOW_AUTH_CONFIG_PATH=$PWD/auth.ini MLFLOW_BACKEND_STORE_URI=$ATLANTIS_DATABASE
 export MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false MLFLOW_DISABLE_TELEMETRY=true
 
-exec "${PYTHON:-python}" -m mlflow server --app-name basic-auth --host 127.0.0.1 --port "$port" --workers "${WORKERS:-2}" \
+exec "$python" -m mlflow server --app-name basic-auth --host 127.0.0.1 --port "$port" --workers "${WORKERS:-2}" \
     --serve-artifacts --artifacts-destination "$PWD/artifacts"

@@ -50,6 +50,27 @@ sys.exit(0 if publisher.drain(120) else 1)
 """
 
 
+def test_secrets_of_any_characters_are_kept_as_they_are_given(tmp_path: Path) -> None:
+    python = tmp_path / "python"
+    python.write_text('#!/bin/sh\nprintf "%s\\n" "$MLFLOW_AUTH_ADMIN_PASSWORD" "$MLFLOW_FLASK_SERVER_SECRET_KEY"\n')
+    python.chmod(0o700)
+    given = {
+        "MLFLOW_AUTH_ADMIN_PASSWORD": "pa $HOME wo'r\"%d=",
+        "MLFLOW_FLASK_SERVER_SECRET_KEY": "c2VjcmV0LWtleS0xMjM=",
+    }
+
+    def started(**environment: str) -> "subprocess.CompletedProcess[str]":
+        own = {"PATH": os.environ["PATH"], "ATLANTIS_DATABASE": "x", "PYTHON": "./python", **environment}
+        command = ["bash", str(REPOSITORY / "docs" / "server.sh"), "folder"]
+        return subprocess.run(command, cwd=tmp_path, env=own, capture_output=True, text=True, check=True)
+
+    first, again = started(**given), started(MLFLOW_AUTH_ADMIN_PASSWORD="other")
+    assert first.stdout.splitlines() == again.stdout.splitlines() == [*given.values()]
+    assert first.stderr == ""
+    assert again.stderr == f"the password of {tmp_path / 'folder' / 'secrets'} counts\n"
+    assert stat.S_IMODE((tmp_path / "folder" / "secrets").stat().st_mode) == 0o600
+
+
 @pytest.fixture
 def database() -> Iterator[str]:
     """The address of an empty PostgreSQL database, which wants a password."""
