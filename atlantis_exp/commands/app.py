@@ -72,7 +72,7 @@ class Verb(Generic[T]):
                 elif not launcher(arguments).is_basic:
                     raise ConfigError(f"hydra/launcher: only trainings can be launched, not {self.name}; drop it")
                 else:
-                    in_turn(lambda each: self.work(each)(), asked)
+                    in_turn(lambda each: self.work(each)(), asked, terminal.warn)
         except Fault as error:
             terminal.warn(str(error))
             sys.exit(error.exit_code)

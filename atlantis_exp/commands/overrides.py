@@ -174,7 +174,7 @@ def launcher(arguments: Sequence[str]) -> Launcher:
         if override.is_delete() or not (is_choice or key.startswith("hydra.launcher.")):
             raise ConfigError(f"{text}: of Hydra's keys, set only hydra/launcher=NAME and hydra.launcher.KEY=VALUE")
         if not flags.multirun:
-            raise ConfigError(f"{text}: applies to a sweep of trainings (-m) and to decide; drop it")
+            raise ConfigError(f"{text}: applies to a sweep of trainings; add -m or drop it")
         if is_choice:
             name = str(override.value())
     names = ["basic", *(path.stem for path in _LAUNCHERS.glob("*.yaml"))]

@@ -17,6 +17,7 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
+from atlantis_exp import terminal
 from atlantis_exp.commands import CONF
 from atlantis_exp.commands.overrides import _set_up, check, launcher, read_override
 from atlantis_exp.config import Config, PathsConfig
@@ -143,10 +144,10 @@ def test_jobs_in_turn_print_every_error_and_raise_the_first(capsys: pytest.Captu
         return None if job == 3 else signal.SIGTERM
 
     with pytest.raises(Fault, match="job 1 fails"):
-        in_turn(work, [1, 2, 3])
+        in_turn(work, [1, 2, 3], terminal.warn)
     assert capsys.readouterr().err == "atlantis_exp: job 2 fails\n"
     with pytest.raises(SystemExit, match="143"):
-        in_turn(work, [1, 4])
+        in_turn(work, [1, 4], terminal.warn)
     assert capsys.readouterr().err == "atlantis_exp: job 1 fails\n"
 
 

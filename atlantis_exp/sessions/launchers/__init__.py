@@ -4,8 +4,6 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
-from atlantis_exp import terminal
-
 T = TypeVar("T")
 
 
@@ -24,10 +22,12 @@ class Launcher(NamedTuple):
 BASIC = Launcher()
 
 
-def in_turn(work: Callable[[T], object], jobs: Iterable[T]) -> None:
-    """Do jobs one after the other; go on after an error, print all but the first, and raise that one at the end.
+def in_turn(work: Callable[[T], object], jobs: Iterable[T], say: Callable[[str], object] = str) -> None:
+    """Do jobs one after the other; go on after an error, and raise the first one at the end.
 
     A signal that came too late to stop a job ends the process after that job.
+
+    say: called with each error that is not raised.
     """
     first: Exception | None = None
     for job in jobs:
@@ -35,12 +35,12 @@ def in_turn(work: Callable[[T], object], jobs: Iterable[T]) -> None:
             late = work(job)
         except Exception as error:
             if first is not None:
-                terminal.warn(str(error))
+                say(str(error))
             first = first or error
         else:
             if isinstance(late, int):
                 if first is not None:
-                    terminal.warn(str(first))
+                    say(str(first))
                 sys.exit(128 + late)
     if first is not None:
         raise first
