@@ -39,7 +39,7 @@ def test_a_mistake_is_raised_in_the_words_of_the_command_line(tmp_path: Path) ->
 
 
 def test_ctrl_c_commits_a_training_which_the_same_call_continues(
-    tiny_overrides: tuple[str, ...], tmp_path: Path
+    tiny_overrides: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     kept = (each for each in tiny_overrides if not each.startswith("phase.quick.steps="))
     words = (*kept, "phase.quick.steps=100_000", f"paths.outputs={tmp_path}")
@@ -55,5 +55,7 @@ def test_ctrl_c_commits_a_training_which_the_same_call_continues(
         atlantis_exp.train(*words)
     thread.join()
     (run,) = tmp_path.glob("runs/*")
-    assert (run / "commit.json").exists()
+    assert [*run.glob("checkpoints/*/manifest.json")]
     assert not (run / "result.json").exists()
+    atlantis_exp.train(*words, "budget.steps=1")
+    assert f"continuing run {run.name} at step " in capsys.readouterr().out

@@ -5,8 +5,10 @@ import inspect
 import json
 import re
 import runpy
+import shlex
 import shutil
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ from PIL import Image
 
 from atlantis_exp.commands import VERBS
 from atlantis_exp.commands.helping import help_text, key_names
+from atlantis_exp.faults import ConfigError
 from atlantis_exp.learning.objectives import Objective
 from atlantis_exp.replay.samplers import Sampler
 
@@ -145,6 +148,37 @@ def lost_links(path: Path) -> set[str]:
         if not target.exists() or (anchor and anchor not in anchors_of(target.read_text())):
             lost.add(link)
     return lost
+
+
+def commands_of(page: Path) -> list[list[str]]:
+    """Return the words of each of our commands on a page, without what a shell does with their output."""
+    text = page.read_text().replace("\\\n", " ")
+    lines = re.findall(r"^(?: {4}|)(?:\$ )?python -m atlantis_exp (.*)$", text, re.MULTILINE)
+    return [shlex.split(re.split(r" (?:2?>|\|) ?", line)[0], comments=True) for line in lines if " ... " not in line]
+
+
+def test_every_command_of_a_page_is_one(
+    command: Callable[..., int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("pretrained", "examples"):
+        (tmp_path / name).symlink_to(REPOSITORY / name)
+    assert command("new", "model=mynet", "to=mine") == 0
+    shutil.copy("mine/atlantis_mynet/mynet.py", "mynet.py")
+    refused, count = [], 0
+    for page in PAGES:
+        for words in commands_of(page):
+            verb, arguments = (words[0], words[1:]) if words[0] in VERBS else ("train", words)
+            count += 1
+            try:
+                if "--help" not in arguments:
+                    import_module(f"atlantis_exp.commands.{verb}").VERB.read(arguments)
+            except ConfigError as error:
+                refused.append(str(error))
+    assert count > 70
+    assert [line for line in refused if not re.search("pip install|srun is not installed", line)] == [
+        line for line in refused if line.startswith("optimizer.lrr=1: no such key")
+    ]
 
 
 PAGES = [REPOSITORY / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")]

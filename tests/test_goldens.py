@@ -181,7 +181,6 @@ def filled_memory() -> ReplayMemory:
     return memory
 
 
-@pytest.mark.thinned(5)
 @pytest.mark.parametrize("line", RUN_NAMES)
 def test_a_run_is_named_as_it_was(line: str) -> None:
     name = composed(*line.split()).run_name()

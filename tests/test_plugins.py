@@ -450,7 +450,6 @@ BROKEN = [  # what is in mynet.py instead of a part of it, the line that is to b
 ]
 
 
-@pytest.mark.thinned(3)
 @pytest.mark.parametrize(
     ("part", "instead", "blamed", "reason"), BROKEN, ids=[f"{each[1]} {each[3]}" for each in BROKEN]
 )

@@ -5,6 +5,7 @@ In: the words of a command line. Out: checked values. Only this package knows th
 
 import importlib
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from atlantis_exp import interrupts
@@ -81,5 +82,6 @@ def _split(words: list[str]) -> tuple[str, list[str]]:
         text = f"atlantis-exp {version('atlantis-exp')}"
     else:
         return verb, arguments
-    terminal.console().print(text)  # survives a closed pipe
+    with suppress(SystemExit):  # of a closed pipe
+        terminal.console().print(text)
     sys.exit(0)

@@ -113,7 +113,7 @@ def test_help_that_nobody_reads_to_its_end_is_no_error() -> None:
             check=False,
             timeout=120,
         )
-    assert asked.stderr == ""
+    assert (asked.returncode, asked.stderr) == (0, "")
 
 
 def test_showing_the_config_prints_one_that_is_valid_and_leaves_nothing_behind(

@@ -53,7 +53,6 @@ Command = Callable[..., int]
         (("model=glob(x*)",), "model=glob(x*): not a list of values; write them out"),
     ],
 )
-@pytest.mark.thinned(8)
 def test_a_question_that_cannot_be_decided_is_one_line_and_code_2_and_leaves_nothing_behind(
     command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], line: str
 ) -> None:

@@ -59,7 +59,6 @@ WORDS = {
 
 
 @pytest.mark.parametrize("overrides", TITLES)
-@pytest.mark.thinned(3)
 def test_a_title_says_what_was_asked_for_and_nothing_else(overrides: str) -> None:
     (job,) = jobs(overrides)
     assert job.title == TITLES[overrides]

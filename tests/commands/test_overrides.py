@@ -210,7 +210,6 @@ MISTAKES = [  # what is written, and what the one line must hold
 
 
 @pytest.mark.parametrize(("line", "key", "hint"), MISTAKES, ids=[line for line, _, _ in MISTAKES])
-@pytest.mark.thinned(5)
 def test_a_mistake_is_one_line_that_names_the_key_and_what_would_be_right(line: str, key: str, hint: str) -> None:
     words = line.split(" ")
     verb = words.pop(0) if words[0] in VERBS else "config"
@@ -291,7 +290,6 @@ def test_a_key_given_twice_is_refused(line: str) -> None:
         "model=cnn -m seed=0,1",
     ],
 )
-@pytest.mark.thinned(4)
 def test_what_is_right_passes(line: str) -> None:
     check("config", Config, re.findall(r"(?:[^ ']|'[^']*')+", line))
 

@@ -301,13 +301,14 @@ def test_trainings_that_cannot_be_compared_are_lost_with_their_configs(recorded:
     "override",
     [
         *("env.id=ALE/Atlantis-v5", "env.frameskip=4", "env.sticky=0.0", "env.max_frames=1000", "env.max_steps=41"),
-        *("env.noop_max=30", "env.crop=[0,160,210,0]", "evaluation.epsilon=0.1"),
+        *("env.noop_max=30", "env.max_pool=true", "env.crop=[0,160,210,0]", "evaluation.epsilon=0.1"),
     ],
 )
 def test_runs_of_different_protocols_are_refused_with_the_difference_named_unless_it_is_the_question(
     recorded: Recorded, tmp_path: Path, override: str
 ) -> None:
-    first, second = recorded(), recorded(override)
+    shared = ("env.frameskip=4",) if "max_pool" in override else ()  # which pools the last two frames
+    first, second = recorded(*shared), recorded(*shared, override)
     trainings = gather(tmp_path).trainings
     key = override.split("=")[0]
     with pytest.raises(ConfigError, match=rf"^{key} differs") as refused:

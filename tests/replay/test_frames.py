@@ -66,6 +66,7 @@ def test_a_generous_budget_reserves_what_all_frames_may_take_and_no_more() -> No
         store.append(store.encode(noise(seed)))
     np.testing.assert_array_equal(store.decode(np.arange(60, 100)), [noise(seed) for seed in range(60, 100)])
     assert (store.oldest_id, store.next_id) == (60, 100)
+    assert len(store._buffer) == 41 * store.max_length
 
 
 def test_screens_of_real_play_come_back_byte_for_byte_and_share_their_background() -> None:

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
@@ -148,6 +149,7 @@ def test_those_who_want_to_be_alone_come_one_after_the_other(tmp_path: Path) -> 
             with alone(tmp_path / "made" / "by.lock"):
                 inside += 1
                 most = max(most, inside)
+                time.sleep(0.001)  # or else nobody comes in between
                 inside -= 1
 
     threads = [threading.Thread(target=work) for _ in range(4)]

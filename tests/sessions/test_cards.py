@@ -70,7 +70,6 @@ def folder(tiny: Compose, tmp_path: Path) -> Path:
         ),
     ],
 )
-@pytest.mark.thinned(3)
 def test_a_folder_that_was_tampered_with_is_one_line(
     command: Command, folder: Path, capsys: pytest.CaptureFixture[str], key: str, value: Any, line: str
 ) -> None:

@@ -145,7 +145,6 @@ def test_a_trial_that_nobody_holds_goes_on_before_a_new_one_is_drawn(searching: 
         assert new.params != trial.params
 
 
-@pytest.mark.thinned(3)
 @pytest.mark.parametrize(
     "line",
     [

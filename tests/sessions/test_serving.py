@@ -3,6 +3,7 @@
 The browser is the system's chromium or the one that playwright has installed; without either the tests are skipped.
 """
 
+import asyncio
 import re
 import shutil
 import signal
@@ -20,9 +21,10 @@ from hydra import compose, initialize_config_dir
 
 from atlantis_exp.commands import CONF
 from atlantis_exp.commands.composing import checked
-from atlantis_exp.config import Config
+from atlantis_exp.config import Config, PathsConfig
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.job import Job
+from atlantis_exp.sessions.serving import serve
 from atlantis_exp.sessions.sweep import ledger
 from atlantis_exp.sessions.training import train
 from atlantis_exp.tracking import views
@@ -38,6 +40,25 @@ def a_finished_run(folder: Path) -> None:
     journal = Journal(folder)
     journal.metrics({"evaluation/mean": 1.0}, 1)
     journal.finish()
+
+
+def test_the_ui_listens_on_this_machine_alone_and_has_no_assistant(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free_port: Callable[[], int]
+) -> None:
+    served: dict[str, Any] = {}
+    monkeypatch.setattr("uvicorn.run", lambda pages, **settings: served.update(pages=pages, **settings))
+    serve(port=free_port(), paths=PathsConfig(outputs=str(tmp_path)))
+    assert served["host"] == "127.0.0.1"
+    sent: list[Any] = []
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    async def receive() -> None: ...
+
+    scope = {"type": "http", "method": "GET", "path": "/ajax-api/3.0/mlflow/assistant/config", "headers": []}
+    asyncio.run(served["pages"](scope, receive, send))
+    assert sent[0]["status"] == 404
 
 
 @pytest.fixture(scope="module")

@@ -266,6 +266,9 @@ def test_a_damaged_run_is_no_obstacle_to_finding_another(tmp_path: Path) -> None
     assert {find_run(tmp_path, name).name for name in ("one", "o", "latest")} == {"one"}
     with pytest.raises(Fault, match=r"other/config\.json is damaged"):
         find_run(tmp_path, "other")
+    shutil.copytree(tmp_path / "runs" / "one", tmp_path / "runs" / "before")
+    os.utime(tmp_path / "runs" / "before" / "config.json", (0, 0))
+    assert find_run(tmp_path, "latest").name == "one"
 
 
 def test_a_run_that_ended_has_its_journal_again_where_its_commit_was_removed(tiny: Compose) -> None:
