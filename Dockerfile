@@ -6,5 +6,5 @@ FROM python:3.12-slim
 RUN apt-get update && apt-get install --yes --no-install-recommends git make && rm -rf /var/lib/apt/lists/*
 WORKDIR /work
 COPY . .
-RUN --mount=type=cache,target=/root/.cache/pip make setup
+RUN make setup
 CMD ["make", "run"]

@@ -10,11 +10,13 @@ from contextlib import contextmanager, redirect_stdout
 from io import TextIOWrapper
 from itertools import count
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from rich.console import Console
-from rich.table import Column, Table
 from rich.text import Text
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 _HERE = Path(__file__).parent
 PROGRAM = "atlantis-exp" if (_HERE / "conf").is_dir() else "python -m atlantis_exp"
@@ -65,8 +67,10 @@ def console(least: int | None = None) -> Console:
     return _Console(width=max(shutil.get_terminal_size().columns, least))
 
 
-def table(*columns: str, title: str | None = None) -> Table:
+def table(*columns: str, title: str | None = None) -> "Table":
     """Return a table whose first column is left-justified, the others right-justified."""
+    from rich.table import Column, Table  # most commands print none
+
     return Table(columns[0], *(Column(each, justify="right") for each in columns[1:]), title=title)
 
 

@@ -6,7 +6,6 @@ import multiprocessing
 import statistics
 import sys
 import time
-from argparse import ArgumentParser
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from importlib.util import find_spec
@@ -73,9 +72,11 @@ def _serve(program: Callable[[], AbstractContextManager[Measure[Any]]], connecti
 class _Help(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter): ...
 
 
-def parser_of(name: str, doc: str | None, rounds: int | None = None, seconds: float | None = None) -> ArgumentParser:
+def parser_of(
+    name: str, doc: str | None, rounds: int | None = None, seconds: float | None = None
+) -> argparse.ArgumentParser:
     """Return a benchmark's parser, with these defaults of --rounds and --seconds if it takes turns."""
-    parser = ArgumentParser(prog=f"python -m benchmarks.{name}", description=doc, formatter_class=_Help)
+    parser = argparse.ArgumentParser(prog=f"python -m benchmarks.{name}", description=doc, formatter_class=_Help)
     if rounds is not None:
         parser.add_argument("--rounds", type=int, default=rounds, help="turns of each")
     if seconds is not None:

@@ -241,7 +241,9 @@ class Outputs:
         self.kept[name] = replace(mine, record=record, account=account.root, errors=dict(account.errors))
         is_false = any(verdict.said != "not decided" for verdict in decision.verdicts)
         self.false |= is_false
-        self.silent |= is_false and not account.is_warned and not seeds_between({str(k): v for k, v in seeds.items()})
+        self.silent |= (
+            is_false and not account.is_warned and not seeds_between({str(k): v for k, v in seeds.items()}, {})
+        )
         return decision
 
 

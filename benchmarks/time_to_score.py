@@ -103,9 +103,8 @@ def stable_baselines3(judge: Judge, make: Callable[[Any], Any]) -> Iterator[Meas
 
     def q_values(states: States) -> npt.NDArray[np.float32]:
         with torch.no_grad():
-            q = network(
-                torch.from_numpy(states).to(model.device)
-            )  # scales bytes itself; (B, A), or quantiles (B, N, A)
+            # It scales bytes itself. (B, A), or quantiles (B, N, A).
+            q = network(torch.from_numpy(states).to(model.device))
         values: npt.NDArray[np.float32] = (q if q.ndim == 2 else q.mean(1)).cpu().numpy()
         return values
 

@@ -36,11 +36,12 @@ def main(outputs: Path, target: Path) -> None:
 
 def keep(run: RunFolder, names: Sequence[str], target: Path, steps: int = 0) -> None:
     """Copy a folder, name its outputs folder `outputs`, and detach it from its sweep."""
-    places = sorted({bytes(run.path.parents[1].absolute()), bytes(run.path.parents[1].resolve())}, key=len)
+    outputs = run.path.parents[1]
+    places = sorted({bytes(outputs.absolute()), bytes(outputs.resolve())}, key=len, reverse=True)
     target = target / run.path.parent.name / run.name
 
     def without_place(content: bytes) -> bytes:
-        for place in reversed(places):
+        for place in places:
             content = content.replace(place, b"outputs")
         return content
 

@@ -239,11 +239,8 @@ def killed_of(module: str, sample: int, seed: int, folder: Path) -> dict[str, An
     survivors: list[str] = []
     try:
         while waiting or running:
-            if (
-                waiting
-                and len(running) < (os.cpu_count() or 1)
-                and not any(each[0] is None for each in running.values())
-            ):
+            is_alone = any(mutant is None for mutant, _, _ in running.values())  # the original
+            if waiting and len(running) < (os.cpu_count() or 1) and not is_alone:
                 mutant = waiting.pop()
                 lines = range(mutant.first, mutant.last + 1) if mutant else ()
                 tests = [test for test in by_cost if any(line in lines for line in watch.called[test])] or by_cost

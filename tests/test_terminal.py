@@ -40,6 +40,14 @@ def test_whatever_is_printed_a_terminal_obeys_nothing_of_it(capsys: pytest.Captu
     assert "[31mred" in printed.out
 
 
+def test_a_table_has_its_names_on_the_left_and_its_numbers_on_the_right(capsys: pytest.CaptureFixture[str]) -> None:
+    table = terminal.table("name", "number", title="both")
+    table.add_row("a", "1")
+    table.add_row("longer", "1,000,000")
+    terminal.console().print(table)
+    assert {"│ a      │         1 │", "│ longer │ 1,000,000 │"} <= {*capsys.readouterr().out.splitlines()}
+
+
 def test_a_console_colours_with_codes_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     screen = io.StringIO()
     monkeypatch.setattr(sys, "stdout", screen)

@@ -209,8 +209,8 @@ def _set_up(settings: DictConfig, override: Override) -> None:
         known = [f"hydra.launcher.{each!s}" for each in settings]
         raise ConfigError(f"{override.input_line}: no such key; {nearest(f'hydra.launcher.{first}', known)}")
     before = settings[first]
-    given = type(before) if below else type(OmegaConf.create({"value": value}).value)
-    if before is not None and (given is not type(before) or (below and given is not DictConfig)):
+    kind = DictConfig if below else type(OmegaConf.create({"value": value}).value)
+    if before is not None and type(before) is not kind:
         raise ConfigError(f"{override.input_line}: should be {_KINDS[type(before)]}, as {before}")
     OmegaConf.update(settings, key, value, force_add=bool(below))
 

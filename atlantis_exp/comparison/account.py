@@ -7,7 +7,6 @@ pairs of groups, alone or among others. It also says how much other questions ab
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, TypeAdapter
@@ -30,9 +29,8 @@ class Asked:
     delta: float | None
     relative: bool
     baseline: str | None
-    groups: Sequence[
-        Annotated[list[str], Field(min_length=1)] | str
-    ]  # label, and hashes of its runs without their seeds
+    # A label, and hashes of its runs without their seeds.
+    groups: Sequence[Annotated[list[str], Field(min_length=1)] | str]
     compared: list[str]  # all runs that it was ever asked about
     account: str = ""  # the comparison whose looks it continues; empty for its own
     errors: dict[str, float] = field(default_factory=dict)  # of the families that continue one
@@ -181,9 +179,7 @@ def open_account(asked: Sequence[Family], mine: Asked, others: Sequence[Asked], 
     return Account(record, errors, root, mine.compared, lines, is_warned=bool(told or gone))
 
 
-def seeds_between(
-    seeds: Mapping[str, Collection[int]], lost: Mapping[str, Collection[int]] = MappingProxyType({})
-) -> dict[str, list[int]]:
+def seeds_between(seeds: Mapping[str, Collection[int]], lost: Mapping[str, Collection[int]]) -> dict[str, list[int]]:
     """Return the seeds that a group lacks below its last one, though another group has them, without its lost ones."""
     every = {seed for own in seeds.values() for seed in own}
     missing = {

@@ -61,7 +61,7 @@ def check(contracts: Iterator[Contract], measured: Mapping[str, Job]) -> None:
             except Exception as error:
                 because = first_line(error) or repr(error)
             tried.append(documents.Trial(component=part, contract=contract, kept=not because, because=because))
-    table = terminal.table("component", "contract", "", "because")
+    table = Table("component", "contract", "", "because")
     for each in tried:
         table.add_row(each.component, each.contract, "kept" if each.kept else "BROKEN", each.because)
     terminal.console(least=120).print(table)

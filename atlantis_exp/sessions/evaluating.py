@@ -67,9 +67,10 @@ def evaluate(
     else:
         if "run" in asked:
             raise ConfigError(f"run={run}: weights={weights} names exported weights; drop one of the two")
-        card, stored = read_card(absolute("weights", weights))
+        exported = absolute("weights", weights)
+        card, stored = read_card(exported)
         trained, step = card.config, card.step
-        name = title = absolute("weights", weights).resolve().name
+        name = title = exported.resolve().name
         source = {"weights": name, "sha256": card.sha256}
         protocol: dict[str, Any] = {
             key: getattr(card.evaluation, key)

@@ -66,10 +66,9 @@ def ledger(
 ) -> Iterator[None]:
     """Print a sweep's table of runs before and after the block, and keep its page.
 
-    There is no page if this process trains them and tracking is none.
-    Jobs in other processes only write their folders: this process shows their progress and publishes them. Each run's
-    folder names its parent before the first run starts; the same set of runs has the same parent. Arguments and faults
-    as for `sweep`.
+    There is no page if this process trains them and tracking is none. Jobs in other processes only write their folders:
+    this process shows their progress and publishes them. Each run's folder names its parent before the first run
+    starts; the same set of runs has the same parent. Arguments and faults as for `sweep`.
     """
     runs = {RunFolder.of(job.config): job for job in jobs}
     is_shown = not launcher.is_basic or jobs[0].config.tracking.name != "none"

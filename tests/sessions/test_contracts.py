@@ -236,6 +236,7 @@ def test_the_table_says_what_is_kept_and_what_it_costs(
     shown = capsys.readouterr().out
     assert "BROKEN" not in shown
     assert re.search(r"killed and continued equals unbroken, bit for bit +│ kept", shown)
+    assert re.search(r"│ model=mine +│ learns: plain, [^│]+│ kept │", shown)  # from the left
     names = ("model=mine", "model=cnn", "model=resnet", "sampler=uniform", "objective=dqn")
     assert [re.search(rf"│ {name} +│ +40 │ +[\d,]+ │", shown) is not None for name in names] == [True] * 5
     assert not (tmp_path / "outputs").exists()

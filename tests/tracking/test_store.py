@@ -27,7 +27,7 @@ def test_importing_the_store_does_not_import_mlflow() -> None:
     subprocess.run([sys.executable, "-c", check], cwd=REPOSITORY, check=True)
 
 
-def test_runs_are_found_by_name_with_their_folder(tmp_path: Path, store: Store) -> None:
+def test_runs_are_found_with_their_folder(tmp_path: Path, store: Store) -> None:
     for name in ("resnet-0", "resnet-1"):
         journal = Journal(tmp_path / name)
         journal.params({"seed": name[-1]})

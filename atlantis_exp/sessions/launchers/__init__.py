@@ -22,7 +22,7 @@ class Launcher(NamedTuple):
 BASIC = Launcher()
 
 
-def in_turn(work: Callable[[T], object], jobs: Iterable[T], say: Callable[[str], object] = str) -> None:
+def in_turn(work: Callable[[T], object], jobs: Iterable[T], say: Callable[[str], object] = lambda _: None) -> None:
     """Do jobs one after the other; go on after an error, and raise the first one at the end.
 
     A signal that came too late to stop a job ends the process after that job.
