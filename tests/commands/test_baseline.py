@@ -15,7 +15,6 @@ def composed(outputs: Path, *overrides: str) -> BaselineConfig:
         return checked(BaselineConfig, compose("baseline", [f"paths.outputs={outputs}", "agent=constant", *overrides]))
 
 
-@pytest.mark.slow
 def test_the_identity_of_a_baseline_depends_on_its_player_and_not_on_its_processes(tmp_path: Path) -> None:
     identity = composed(tmp_path).identity()
     assert composed(tmp_path / "elsewhere", "env.workers=2", "tracking=none").identity() == identity

@@ -111,10 +111,14 @@ def test_contenders_are_trained_level_until_a_look_decides_and_compare_says_the_
     assert {name: (tmp_path / "runs" / name / "result.json").stat().st_mtime_ns for name in began} == began
 
 
-@pytest.mark.slow
 def test_decided_pairs_are_dropped_and_each_look_is_on_the_page_once(
-    asking: Asking, recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    asking: Asking,
+    recorded: Recorded,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.setattr("atlantis_exp.sessions.comparing.draw", lambda _: {})  # most of the time
     rates = {0.001: 9_000.0, 0.002: 1_000.0, 0.003: 1_000.0}
     contest = asking("optimizer.lr=0.001,0.002,0.003")
     assert list(contest.contenders) == [f"lr={rate}" for rate in rates]
@@ -152,7 +156,6 @@ def test_decided_pairs_are_dropped_and_each_look_is_on_the_page_once(
     assert note.index(contest.comparing) < note.index("looks planned at")  # MLflow cuts the end of a long note
 
 
-@pytest.mark.slow
 def test_what_stops_a_training_stops_its_decision_with_the_same_code(
     asking: Asking, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -286,7 +289,6 @@ def test_a_question_about_the_training_score_is_handed_on_with_its_window(asking
     assert asking("optimizer.lr=0.001,0.002", "window=25%").folder == asking("optimizer.lr=0.001,0.002").folder
 
 
-@pytest.mark.slow
 def test_contenders_that_explore_differently_are_refused_by_the_training_score_before_they_are_trained(
     asking: Asking,
 ) -> None:
@@ -295,7 +297,6 @@ def test_contenders_that_explore_differently_are_refused_by_the_training_score_b
         asking("epsilon=constant", "epsilon.value=0.1,0.2", "score=training")
 
 
-@pytest.mark.slow
 def test_the_same_question_is_the_same_decision_however_it_is_written(asking: Asking) -> None:
     one = asking("optimizer.lr=0.001,0.002", "budget.steps=1_000_000")
     again = asking("optimizer.lr=0.002,1e-3", "budget.steps=1000000", "threads=2", "tracking=mlflow")

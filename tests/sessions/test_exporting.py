@@ -33,12 +33,19 @@ Command = Callable[..., int]
 Compose = Callable[..., Config]
 
 
+@pytest.fixture(scope="module")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for what is trained only once."""
+    return tmp_path_factory.mktemp("once")
+
+
 @pytest.fixture
-def trained(tiny: Compose) -> Path:
+def trained(tiny: Compose, once: Path, tmp_path: Path) -> Path:
     """The outputs folder of a training with evaluations at steps 80 and 160."""
-    config = tiny("env.max_steps=200")
-    train(Job(config))
-    return Path(config.paths.outputs)
+    if not (once / "runs").exists():
+        train(Job(tiny("env.max_steps=200", f"paths.outputs={once}")))
+    shutil.copytree(once, tmp_path, dirs_exist_ok=True)
+    return tmp_path
 
 
 @pytest.fixture
@@ -62,7 +69,6 @@ def test_an_exports_folder_is_typed_as_in_a_shell_and_is_not_the_one_that_it_is_
     assert command("evaluate", "weights='~/here'", *shared, "tracking=none") == 0
 
 
-@pytest.mark.slow
 def test_a_training_begins_with_exported_weights_also_where_it_was_killed_before_its_first_commit(
     tiny: Compose, exported: Path, tmp_path: Path
 ) -> None:

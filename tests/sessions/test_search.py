@@ -128,7 +128,6 @@ def test_a_signal_that_comes_when_a_trial_has_nothing_left_to_stop_ends_the_sear
     assert [trial.state.name for trial in Trials(request).all] == ["COMPLETE"]
 
 
-@pytest.mark.slow
 def test_a_trial_that_nobody_holds_goes_on_before_a_new_one_is_drawn(searching: Searching) -> None:
     trials = trials_of(searching, "trials=3")
     with trials.claimed() as left:
@@ -208,7 +207,6 @@ def played(recorded: Callable[..., Path]) -> Played:
     return play
 
 
-@pytest.mark.slow
 def test_a_trial_is_as_good_as_the_mean_of_its_seeds(
     searching: Searching, played: Played, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -65,6 +65,18 @@ def test_the_forecast_is_measured_before_there_is_anything_for_mlflow(
     assert folder.state == "done"
 
 
+def test_a_training_whose_memory_will_not_suffice_is_refused_before_it_begins(
+    tiny: Compose, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "atlantis_exp.sessions.training.forecast", lambda *_, **__: Forecast(1, 40, 2 * 2**20, 2**20, 0, 1)
+    )
+    config = tiny(*SHORT, "budget.forecast=refuse")
+    with pytest.raises(Fault, match=r"memory will not suffice: 2 MiB needed, .*; budget\.forecast=warn starts anyway"):
+        train(Job(config))
+    assert not list(RunFolder.of(config).checkpoints.glob("*/manifest.json"))
+
+
 @pytest.mark.slow
 def test_a_forecast_changes_nothing_of_a_training(tiny: Compose, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[float] = []
