@@ -39,6 +39,9 @@ from atlantis_exp.training.trainer import Trainer
 
 Serving = AbstractContextManager[None]
 
+for _name in ("COLUMNS", "FORCE_COLOR", "LINES", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
+    os.environ.pop(_name, None)  # rich's, of the terminal that the tests are started in
+
 settings.register_profile("untimed", deadline=None)  # a busy machine must not fail a test
 settings.load_profile("untimed")
 
