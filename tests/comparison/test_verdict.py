@@ -458,6 +458,12 @@ def test_collapsed_policies_and_equal_scores_are_named() -> None:
     assert comparison.tables["evaluation"][0]["runs"] == 5
 
 
+def test_runs_that_lost_a_part_of_their_replay_memory_are_named() -> None:
+    runs = [*around("cnn", 1_000.0, range(4)), *around("cnn", 1_000.0, [4], tags={"lost": "7 observations"})]
+    caveats = compared([*runs, *around("resnet", 5_000.0)]).caveats
+    assert "Continued without a damaged part of their replay memory: cnn-uniform-s4." in caveats
+
+
 def test_runs_of_a_look_that_are_gone_or_score_otherwise_are_named() -> None:
     runs = [*around("cnn", 3_000.0, range(6)), *around("resnet", 5_000.0, range(6))]
     record = {each.family.name: each.decision.looks for each in compared(runs[:5] + runs[6:11]).answers}

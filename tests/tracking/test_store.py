@@ -5,10 +5,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
+from typing import cast
 
 import pytest
+from mlflow import MlflowClient
 from mlflow.exceptions import MlflowException
 
 from atlantis_exp.faults import Fault
@@ -16,6 +18,7 @@ from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.syncing import publish_all
 from atlantis_exp.tracking.mirror import publish
 from atlantis_exp.tracking.publishing import Publisher
+from atlantis_exp.tracking.server import PatientClient, TooSlow
 from atlantis_exp.tracking.store import Store
 from tests.tracking.folders import a_full_journal, commit, rows
 
@@ -139,6 +142,23 @@ def test_a_database_that_cannot_be_used_is_one_line_with_the_remedy_for_every_co
     while not any(re.fullmatch(line, record.getMessage()) for record in caplog.records):
         assert time.monotonic() < patience
         time.sleep(0.05)
+
+
+@pytest.mark.parametrize("pieces", [0, 1])
+def test_a_server_has_a_second_and_one_more_for_each_piece_of_a_file(tmp_path: Path, pieces: int) -> None:
+    class Server:
+        def log_artifact(self, _: str, path: str) -> None:
+            assert Path(path).stat().st_size == pieces * 2**16
+            try:
+                time.sleep(1.5)
+            except TooSlow as error:
+                raise MlflowException("wrapped") from error
+
+    file = tmp_path / "file"
+    file.write_bytes(bytes(pieces * 2**16))
+    client = PatientClient(cast(MlflowClient, Server()), 1)
+    with nullcontext() if pieces else pytest.raises(TooSlow, match="within 1 seconds"):
+        client.log_artifact("run", str(file))
 
 
 def test_a_database_that_breaks_while_it_is_used_is_the_stores_fault(tmp_path: Path) -> None:
