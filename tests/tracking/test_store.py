@@ -136,12 +136,15 @@ def test_a_database_that_cannot_be_used_is_one_line_with_the_remedy_for_every_co
         [*publish_all(tmp_path, Store(tmp_path))]
     with pytest.raises(Fault, match=said):
         Store(tmp_path).prepare()
-    Publisher(folder, Store(tmp_path))
+    publisher = Publisher(folder, Store(tmp_path))
     line = rf"Publishing to MLflow fails \({said}\); the run continues and is published later"
     patience = time.monotonic() + 120
     while not any(re.fullmatch(line, record.getMessage()) for record in caplog.records):
         assert time.monotonic() < patience
         time.sleep(0.05)
+    (tmp_path / "mlflow.db").unlink()
+    mlflow_tables(tmp_path)
+    assert publisher.drain(120)
 
 
 @pytest.mark.parametrize("pieces", [0, 1])
