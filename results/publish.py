@@ -245,7 +245,7 @@ def of_rewards() -> Iterator[tuple[str, str]]:
         yield LAB, row.replace("27,000 to 27,000", "27,000")
     runs = [run for run in to_a_power("rewards") if run.trained_config.objective.gamma == 0.99]
     (longer,) = [run for run in to_a_power("rewards") if run not in runs]
-    for path in sorted((RESULTS / "rewards").glob("clock_*.csv")):
+    for path in sorted((RESULTS / "rewards").glob("*.csv")):
         games = EpisodeTable.read(path, SOURCES)
         capped = games.scores[games.truncated.astype(bool)]
         points = whole((capped.mean(), capped.max(), games.scores.mean()))
