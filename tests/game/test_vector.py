@@ -204,7 +204,7 @@ def test_a_worker_killed_in_a_step_is_named_and_the_others_end(mortal: tuple[Pro
         emulators.receive()
 
 
-@pytest.mark.parametrize("is_asked_to_stop", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize("is_asked_to_stop", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_worker_that_hangs_is_named_and_the_others_end(
     mortal: tuple[ProcessEmulators, list[int]], is_asked_to_stop: bool
 ) -> None:
