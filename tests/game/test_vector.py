@@ -204,11 +204,12 @@ def test_a_worker_killed_in_a_step_is_named_and_the_others_end(mortal: tuple[Pro
         emulators.receive()
 
 
-@pytest.mark.parametrize("is_asked_to_stop", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("is_asked_to_stop", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_worker_that_hangs_is_named_and_the_others_end(
-    mortal: tuple[ProcessEmulators, list[int]], is_asked_to_stop: bool
+    mortal: tuple[ProcessEmulators, list[int]], monkeypatch: pytest.MonkeyPatch, is_asked_to_stop: bool
 ) -> None:
     emulators, (victim, _) = mortal
+    monkeypatch.setattr("atlantis_exp.game.vector._LAST_SECONDS", 2)
     emulators.patience = 60 if is_asked_to_stop else 2
     emulators.stop = lambda: is_asked_to_stop
     os.kill(victim, signal.SIGSTOP)

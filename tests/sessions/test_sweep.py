@@ -22,8 +22,10 @@ from atlantis_exp.runs.journal import NOTE, Artifact, Journal, Tags
 from atlantis_exp.sessions.job import Job, fitted
 from atlantis_exp.sessions.launchers import BASIC, Launcher
 from atlantis_exp.sessions.sweep import _every, ledger, say_hours
-from atlantis_exp.sessions.training import train
+from atlantis_exp.sessions.training import measure, train
 from atlantis_exp.tracking.publishing import catch_up
+from atlantis_exp.training.forecast import Forecast
+from atlantis_exp.training.trainer import Trainer
 
 Compose = Callable[..., Config]
 ELSEWHERE = Launcher("elsewhere")  # none that needs a library
@@ -154,10 +156,19 @@ def test_a_sweep_is_finished_once_all_its_runs_are(
 
 
 def test_a_sweep_says_how_many_trainings_go_on_at_a_time_and_for_how_long(
-    tiny: Compose, recorded: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+    tiny: Compose, recorded: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     jobs = [Job(tiny(f"seed={seed}", "budget.forecast=warn")) for seed in (0, 1)]
+    hours: list[float] = []
+
+    def measured(job: Job, cores: int | None) -> tuple[Trainer, Forecast]:
+        trainer, forecast = measure(job, cores)
+        hours.append(forecast.hours)
+        return trainer, forecast
+
+    monkeypatch.setattr("atlantis_exp.sessions.sweep.measure", measured)
     say_hours(jobs, Launcher("joblib", {"n_jobs": 8, "cores": 1}))
+    assert 0 < hours[0] < 1
     told = capsys.readouterr().out.splitlines()[-1]
     assert re.fullmatch(r"8 trainings at a time, 1 core each: about .+ if all take as long as cnn uniform s0", told)
     say_hours([Job(tiny())], Launcher("joblib", {"n_jobs": 2, "cores": 2}))  # a forecast is not wanted
