@@ -60,7 +60,11 @@ class SoonDue(Cue):
 
 @pytest.mark.parametrize(
     ("game", "lags", "remembers", "is_solved"),
-    [(Cue, (0, 1, 2, 20), False, True), (SoonDue, range(4), False, False), (SoonDue, (0,), True, True)],
+    [
+        (Cue, (0, 1, 2, 20), False, True),
+        pytest.param(SoonDue, range(4), False, False, marks=pytest.mark.slow),
+        (SoonDue, (0,), True, True),
+    ],
 )
 def test_a_state_that_reaches_back_to_the_light_or_a_memory_solves_what_four_observations_cannot(
     small: Callable[..., Trainer],
