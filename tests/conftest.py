@@ -39,7 +39,7 @@ from atlantis_exp.training.trainer import Trainer
 
 Serving = AbstractContextManager[None]
 
-for _name in ("COLUMNS", "FORCE_COLOR", "LINES", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
+for _name in ("COLUMNS", "FORCE_COLOR", "LINES", "NO_COLOR", "TERM", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
     os.environ.pop(_name, None)  # rich's, of the terminal that the tests are started in
 
 settings.register_profile("untimed", deadline=None)  # a busy machine must not fail a test
