@@ -22,7 +22,9 @@ def train(*overrides: str) -> RunFolder:
 
     Returns the run's folder: `.name`, `.path`, and `.result`, which is None until the training has ended.
     """
-    config, _ = _done(_training.VERB, overrides)
+    config, late = _done(_training.VERB, overrides)
+    if late is not None:  # a signal after the last step
+        raise KeyboardInterrupt
     return RunFolder.of(config)
 
 

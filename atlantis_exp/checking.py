@@ -69,10 +69,10 @@ def absolute(key: str, text: str) -> Path:
     return path
 
 
-def check_new(key: str, folder: Path) -> None:
-    """Raise ConfigError if a new folder exists and is not empty."""
+def check_new(folder: Path) -> None:
+    """Raise ConfigError if the folder of `to=` exists and is not empty."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigError(f"{key}={folder}: is not empty; name another folder")
+        raise ConfigError(f"to={folder}: is not empty; name another folder")
 
 
 def check_server(key: str, uri: str | None) -> None:
@@ -128,7 +128,7 @@ def _explain(faults: list[ErrorDetails], tree: Mapping[str, Any]) -> str:
     key, kind = ".".join(path), fault["type"]
     if kind == "unexpected_keyword_argument":
         return f"{key}: no such key; {nearest(path[-1], set(siblings) - {path[-1]})}"
-    if kind in ("missing_argument", "missing"):
+    if kind == "missing":
         return f"{key}: missing; it has no default"
     if kind == "union_tag_invalid":
         tags = str(fault["ctx"]["expected_tags"]).replace("'", "").split(", ")
@@ -161,7 +161,7 @@ def _locate(fault: ErrorDetails, tree: Mapping[str, Any]) -> tuple[list[str], Ma
             if part in node:
                 node = node[str(part)]
                 path.append(str(part))
-            elif fault["type"] in ("missing_argument", "missing") and part == fault["loc"][-1]:
+            elif fault["type"] == "missing" and part == fault["loc"][-1]:
                 path.append(str(part))
         elif isinstance(node, list) and isinstance(part, int):
             node = node[part] if part < len(node) else None

@@ -32,6 +32,7 @@ from atlantis_exp.components import (
     title_of,
 )
 from atlantis_exp.faults import ConfigError
+from atlantis_exp.games import SCREEN
 
 # Deferred, since the schemas of all verbs together take a tenth of a second to build.
 STRICT = ConfigDict(defer_build=True, strict=True, extra="forbid", allow_inf_nan=False)
@@ -62,7 +63,6 @@ FREE = frozenset(("plugins", "resume", "device", "threads", "compile", "tracking
 """Keys that are not part of a run's identity; of `plugins`, those that the run uses are."""
 
 _INDEX_BYTES = 23  # of the replay memory, per observation
-SCREEN = (210, 160)  # rows, columns of the emulator's screen
 
 
 def _check_stack(stack: int | tuple[int, ...]) -> int | tuple[int, ...]:

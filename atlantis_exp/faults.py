@@ -11,10 +11,6 @@ class Fault(RuntimeError):
         self.exit_code = exit_code
 
 
-class RunFault(Fault):
-    """Ended a run at its last commit, where the same command continues it."""
-
-
 class ConfigError(Fault, ValueError):
     """A user's mistake, in one line that names the key and the nearest valid choice."""
 

@@ -4,6 +4,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+SCREEN = (210, 160)  # rows, columns of the emulator's screen
+
 
 @dataclass(frozen=True)
 class Game:

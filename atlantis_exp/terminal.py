@@ -1,6 +1,8 @@
 """Print to a terminal: texts without markup or control characters, work in progress, durations."""
 
 import os
+import re
+import shlex
 import shutil
 import sys
 import threading
@@ -77,6 +79,19 @@ def table(*columns: str, title: str | None = None) -> "Table":
 def harmless(text: str) -> str:
     """Return a text without control characters other than newlines."""
     return "".join(character for character in text if character == "\n" or character.isprintable())
+
+
+def command_line(*arguments: str) -> str:
+    """Return one of our commands, quoted for a shell."""
+    return " ".join((PROGRAM, *map(shlex.quote, arguments)))
+
+
+def quoted(value: object) -> str:
+    """Return the text of a value, quoted for Hydra if needed."""
+    text = str(value)
+    if re.fullmatch(r"(?!(null|true|false|nan|inf)$)[a-z_/][\w/.+:%@-]*", text, re.ASCII | re.IGNORECASE):
+        return text
+    return '"' + re.sub(r'(\\*)("|$)', lambda match: match[1] * 2 + match[2].replace('"', r"\""), text) + '"'
 
 
 def warn(text: str) -> None:

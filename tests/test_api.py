@@ -38,6 +38,14 @@ def test_a_mistake_is_raised_in_the_words_of_the_command_line(tmp_path: Path) ->
         _ = atlantis_exp.trian
 
 
+def test_ctrl_c_after_the_last_step_is_raised_once_all_is_published(
+    tiny_overrides: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("atlantis_exp.sessions.training.train", lambda _: signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        atlantis_exp.train(*tiny_overrides, f"paths.outputs={tmp_path}")
+
+
 def test_ctrl_c_commits_a_training_which_the_same_call_continues(
     tiny_overrides: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -11,8 +11,8 @@ from atlantis_exp.commands.composing import admit_plugins
 from atlantis_exp.commands.overrides import check, flags_of, launcher, located, refuse_twice, shown
 from atlantis_exp.faults import ConfigError, Fault, in_words
 from atlantis_exp.machine import Machine, here
-from atlantis_exp.sessions.job import command_line
 from atlantis_exp.sessions.launchers import Launcher, in_turn
+from atlantis_exp.terminal import command_line
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)

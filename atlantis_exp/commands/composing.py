@@ -82,10 +82,7 @@ def pinned(weights: str) -> str:
 
 def admit_plugins(plugins: Any) -> None:
     """Admit the plugins of the key `plugins`, and add their components to the groups. Raises: ConfigError."""
-    references = [plugins] if isinstance(plugins, str) else plugins or []
-    if isinstance(references, dict | DictConfig) or not all(isinstance(each, str) for each in references):
-        raise ConfigError(f"plugins={plugins}: write files and distributions, as in plugins=[./mynet.py,mypackage]")
-    components.admit(references)
+    components.admit([plugins] if isinstance(plugins, str) else plugins or [])
     for component in components.admitted().values():
         if (CONF / component.kind / f"{component.name}.yaml").is_file():
             raise ConfigError(

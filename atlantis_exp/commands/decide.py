@@ -26,7 +26,7 @@ from atlantis_exp.commands.overrides import (
 from atlantis_exp.commands.train import train_on_a_node
 from atlantis_exp.config import FREE, STRICT, Config
 from atlantis_exp.faults import ConfigError
-from atlantis_exp.sessions.job import command_line
+from atlantis_exp.terminal import command_line
 
 if TYPE_CHECKING:
     from atlantis_exp.sessions.deciding import Contest

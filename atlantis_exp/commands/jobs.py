@@ -32,7 +32,7 @@ def words_of(overrides: Sequence[str]) -> tuple[str, ...]:
         key, value = override.get_key_element(), override.value()
         word = "" if override.is_delete() else value if isinstance(value, str) else json.dumps(value)
         root = key.lstrip("~").split(".")[0]
-        if key in _TITLED or root in FREE or key in ("env.workers",) or word == "none":
+        if key in _TITLED or root in FREE or key == "env.workers" or word == "none":
             continue
         if key in _BARE:
             options[key] = word

@@ -29,8 +29,8 @@ from atlantis_exp.commands.helping import options_of
 from atlantis_exp.components import KINDS, admitted, installed
 from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.files import SMALL, read_file
-from atlantis_exp.sessions.job import quoted
 from atlantis_exp.sessions.launchers import BASIC, Launcher
+from atlantis_exp.terminal import quoted
 
 T = TypeVar("T")
 
@@ -76,14 +76,14 @@ def located(arguments: Sequence[str]) -> list[str]:
         *(["-m"] if flags.multirun else []),
         *(["--cfg", flags.cfg] if flags.cfg else []),
         *(["--resolve"] if flags.resolve else []),
-        *(re.sub(r"^plugins=(.+)$", _located, text, flags=re.DOTALL) for text in itertools.chain(*parts)),
+        *(re.sub(r"^plugins=(?!null$)(.+)$", _located, text, flags=re.DOTALL) for text in itertools.chain(*parts)),
     ]
 
 
 def _from_file(name: str) -> list[str]:
     """Return the overrides in a YAML file: for each key a value, a list of values, or Hydra's syntax for them."""
     try:
-        tree = safe_load(read_file(absolute("sweep", name), SMALL))
+        tree = safe_load(read_file(absolute("sweep", name).resolve(), SMALL))
         return [_override(key, value) for key, value in flatten(tree).items()]
     except (OSError, ValueError, TypeError, AttributeError, RecursionError, YAMLError) as error:
         reason = " ".join(str(error).split())
@@ -97,8 +97,8 @@ def _override(key: str, value: object) -> str:
 
 def _located(match: re.Match[str]) -> str:
     """Return plugins as one list, however they were written."""
-    references = []
-    for text in match[1].removeprefix("[").removesuffix("]").split(","):
+    references, texts = [], match[1].removeprefix("[").removesuffix("]")
+    for text in texts.split(",") if texts else ():
         reference = text.strip().strip("'\"")
         if "/" in reference or reference.endswith(".py"):
             reference = str(absolute("plugins", reference))
@@ -198,7 +198,7 @@ def launcher(arguments: Sequence[str]) -> Launcher:
     return Launcher(name, OmegaConf.to_container(settings))  # type: ignore[arg-type]
 
 
-_KINDS = {int: "a number", bool: "true or false", str: "text", DictConfig: "a mapping", ListConfig: "a list"}
+_KINDS = {int: "an integer", bool: "true or false", str: "text", DictConfig: "a mapping", ListConfig: "a list"}
 
 
 def _set_up(settings: DictConfig, override: Override) -> None:

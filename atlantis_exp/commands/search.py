@@ -14,7 +14,8 @@ from atlantis_exp.commands.overrides import key_of, refuse_twice, swept, with_fi
 from atlantis_exp.components import Count
 from atlantis_exp.config import FREE, STRICT, Config
 from atlantis_exp.faults import ConfigError, Fault
-from atlantis_exp.sessions.job import command_line, replaced
+from atlantis_exp.sessions.job import replaced
+from atlantis_exp.terminal import command_line
 
 if TYPE_CHECKING:
     from atlantis_exp.sessions.search import Search
@@ -57,7 +58,7 @@ CLOSED = _OWN | FREE | {"seed", "evaluation"}
 
 def _first_trial(arguments: list[str]) -> list[str]:
     """Keep only the first value of each searched key."""
-    if {"-m", "--multirun"} & set(arguments):
+    if "-m" in arguments:
         raise ConfigError("-m: a search is not a sweep; drop -m")
     refuse_twice([argument.removeprefix("space.") for argument in arguments])
     return with_first_values(arguments)

@@ -35,7 +35,7 @@ class SyncConfig:
 def _work(asked: Asked[SyncConfig]) -> Callable[[], None]:
     from atlantis_exp.sessions.syncing import sync
 
-    return partial(sync, **vars(asked.config), seconds=asked.config.seconds)
+    return partial(sync, **{**vars(asked.config), "every": asked.config.seconds})
 
 
 VERB = Verb("sync", SyncConfig, _work)

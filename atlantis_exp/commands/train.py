@@ -9,8 +9,9 @@ from atlantis_exp.commands.jobs import job_of
 from atlantis_exp.commands.overrides import flags_of, key_of, swept
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
-from atlantis_exp.sessions.job import Job, command_line
+from atlantis_exp.sessions.job import Job
 from atlantis_exp.sessions.launchers import BASIC, Launcher
+from atlantis_exp.terminal import command_line
 
 
 def _work(asked: Asked[Config]) -> Callable[[], object]:

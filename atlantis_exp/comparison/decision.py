@@ -267,7 +267,7 @@ def size_found(verdict: Verdict, look: Look, pairs: int) -> float:
         upto, smaller = nctdtr(freedom, shift, (limit, t))
         return float((below + smaller - upto) / (below + 1 - upto) - 0.5)
 
-    return float(np.sign(verdict.difference) * error * _falls_to(above_half, 0.0, t))
+    return float(np.sign(verdict.difference) * error * _falls_to(above_half, t))
 
 
 def may_be_best(decision: Decision) -> list[str]:
@@ -302,13 +302,14 @@ def improvement(one: npt.ArrayLike, other: npt.ArrayLike) -> tuple[float, float,
             spread = true * (1 - true) * (1 + half * ((1 - true) / (2 - true) + true / (1 + true)))
             return float(share - true - 1.96 * np.sqrt(spread / (seeds.size * others.size)))
 
-        return _falls_to(above, 0.0, share)
+        return _falls_to(above, share)
 
     return low(found), found, 1 - low(1 - found)
 
 
-def _falls_to(zero: Callable[[float], float], low: float, high: float) -> float:
-    """Find the zero of a falling function by bisection."""
+def _falls_to(zero: Callable[[float], float], high: float) -> float:
+    """Find the zero of a falling function between 0 and `high` by bisection."""
+    low = 0.0
     for _ in range(50):
         middle = (low + high) / 2
         low, high = (middle, high) if zero(middle) > 0 else (low, middle)

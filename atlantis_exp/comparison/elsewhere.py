@@ -28,7 +28,9 @@ def read_scores(path: Path, columns: Mapping[str, str]) -> list[Group]:
     columns = dict(zip(_COLUMNS, _COLUMNS, strict=True)) | dict(columns)
     found: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     try:
-        reader = csv.DictReader(io.StringIO(read_file(path, SMALL).decode("utf-8-sig"), newline=""), strict=True)
+        reader = csv.DictReader(
+            io.StringIO(read_file(path.resolve(), SMALL).decode("utf-8-sig"), newline=""), strict=True
+        )
         header = reader.fieldnames or []
         for key, name in columns.items():
             if header.count(name) != 1:

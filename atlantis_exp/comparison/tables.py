@@ -121,8 +121,8 @@ def compare(
         "evaluation": [_evaluation(label, runs, game) for label, runs in groups.items()],
         "why": [_why(label, runs, game.sources) for label, runs in groups.items()],
         "improvement": [
-            {"group": one, "over": other, "probability": probability_of_improvement(*map(_pooled, pair))}
-            for (one, other), pair in zip(combinations(groups, 2), combinations(groups.values(), 2), strict=True)
+            {"group": one, "over": other, "probability": probability_of_improvement(_pooled(mine), _pooled(theirs))}
+            for (one, mine), (other, theirs) in combinations(groups.items(), 2)
         ],
         "views": _views(groups),
         "runs": _runs(groups),

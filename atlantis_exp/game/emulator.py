@@ -9,8 +9,8 @@ from ale_py import ALEInterface, ALEState, LoggerMode
 from ale_py.roms import get_all_rom_ids, get_rom_path
 
 from atlantis_exp.faults import ConfigError
-from atlantis_exp.game.preprocessing import SCREEN_HEIGHT, SCREEN_WIDTH, Pixels, Preprocessing
-from atlantis_exp.games import Game
+from atlantis_exp.game.preprocessing import Pixels, Preprocessing
+from atlantis_exp.games import SCREEN, Game
 
 ALEInterface.setLoggerMode(LoggerMode.Error)  # of the whole process, and before the first emulator prints its banner
 
@@ -33,8 +33,8 @@ def check_game(game: Game) -> None:
         raise ConfigError(f"{game.rom}: ALE has no ROM of that name")
     ale = ALEInterface()
     ale.loadROM(cast(Path, get_rom_path(game.rom)))
-    if (screen := ale.getScreenDims()) != (playable := (SCREEN_HEIGHT, SCREEN_WIDTH)):
-        raise ConfigError(f"{game.rom}: its screen is {screen} pixels; only {playable} can be played")
+    if (screen := ale.getScreenDims()) != SCREEN:
+        raise ConfigError(f"{game.rom}: its screen is {screen} pixels; only {SCREEN} can be played")
     if (actions := tuple(action.name for action in ale.getMinimalActionSet())) != game.actions:
         raise ConfigError(f"{game.rom}: actions = {game.actions}: should be ALE's, {actions}")
 
@@ -77,7 +77,7 @@ class Emulator:
         self._ale.setInt("max_num_frames_per_episode", max_frames)
         self._is_loaded = False  # loading takes as long as a thousand frames, and each seed needs it
         self._steps = 0
-        self._screen: Pixels = np.zeros((SCREEN_HEIGHT, SCREEN_WIDTH), np.uint8)  # grey
+        self._screen: Pixels = np.zeros(SCREEN, np.uint8)  # grey
         self._pool = preprocessing.cut(self._screen)  # of the last step, cropped; max_pool only
 
     @property

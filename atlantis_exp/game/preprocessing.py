@@ -11,25 +11,17 @@ import numpy.typing as npt
 Pixels = npt.NDArray[np.uint8]
 Envs = Sequence[int] | npt.NDArray[np.intp]
 
-SCREEN_HEIGHT, SCREEN_WIDTH = 210, 160  # pixels
-
 
 @dataclass(frozen=True)
 class Preprocessing:
     """Turn a screen in ALE's grey, (210, 160) uint8, into an observation, (size, size) uint8.
 
     Crop, area interpolation: within one grey level of 255 times the float of report figure 2.3. `crop` is its
-    `exclude`, (UP, RIGHT, DOWN, LEFT) in pixels, and keeps rows UP to DOWN - 1 and columns LEFT to RIGHT - 1. Raises
-    ValueError if it leaves the screen.
+    `exclude`, (UP, RIGHT, DOWN, LEFT) in pixels, and keeps rows UP to DOWN - 1 and columns LEFT to RIGHT - 1.
     """
 
     size: int
     crop: tuple[int, int, int, int]
-
-    def __post_init__(self) -> None:
-        up, right, down, left = self.crop
-        if not (0 <= up < down <= SCREEN_HEIGHT and 0 <= left < right <= SCREEN_WIDTH):
-            raise ValueError(f"crop (UP, RIGHT, DOWN, LEFT) = {self.crop} is not inside a 210x160 screen")
 
     def __call__(self, screen: Pixels) -> Pixels:
         return self.resize(self.cut(screen))

@@ -12,7 +12,6 @@ from contextlib import contextmanager, suppress
 from ctypes import Array, c_ubyte
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
-from types import TracebackType
 from typing import Any, NamedTuple, Self, final
 
 import cv2
@@ -20,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import psutil
 
-from atlantis_exp.faults import RunFault
+from atlantis_exp.faults import Fault
 from atlantis_exp.game.emulator import Emulator
 from atlantis_exp.game.preprocessing import Envs, Pixels
 from atlantis_exp.games import Game
@@ -33,7 +32,7 @@ _LAST_SECONDS = 5  # of patience after a request to stop
 _FOR_THE_PARENT = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 
 
-class WorkerDied(RunFault):
+class WorkerDied(Fault):
     """A worker process has died or hangs; the message names it, its environments and the cause."""
 
 
@@ -101,9 +100,7 @@ class Emulators(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @abstractmethod

@@ -30,9 +30,8 @@ class DQNCnn(nn.Module):
             nn.Flatten(),  # before the ReLU, whose gradient would otherwise wait for moving channels
             nn.ReLU(),
         )
-        self.feature_size = 64 * _last_side(height) * _last_side(width)
         self.fc = nn.Sequential(
-            nn.Linear(self.feature_size, 512),
+            nn.Linear(64 * _last_side(height) * _last_side(width), 512),
             nn.ReLU(),
             head(512, num_actions),
         )

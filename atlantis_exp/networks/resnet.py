@@ -71,10 +71,9 @@ class ResNetDQN(nn.Module):
             ResNetBlock(64, nn.SiLU, 128),  # 10x10
             ResNetBlock(128, nn.SiLU),
         )
-        self.flattened_size = 128 * _last_side(height) * _last_side(width)
         self.regression = nn.Sequential(
             Dropout(0.3),
-            nn.Linear(self.flattened_size, 1024),
+            nn.Linear(128 * _last_side(height) * _last_side(width), 1024),
             Dropout(0.2),
             nn.SiLU(inplace=True),
             head(1024, num_actions),

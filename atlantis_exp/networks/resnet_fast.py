@@ -29,7 +29,7 @@ class ResNetFast(nn.Module):
 
     ResNetDQN needs 1.87, most of it in a stem that works on 77x77. Here the stem is DQNCnn's first layer. Two stages
     follow, each a convolution that halves the sides and a residual block, then two dense layers. It has no batch
-    statistics and no dropout. Its 3.4 million parameters take 6.9 MB in half precision.
+    statistics and no dropout. It has 3.4 million parameters.
 
     Maps (B, C, H, W) in [0, 1] to the output of `head`, (B, num_actions) by default. It is made for H = W = 159;
     `input_shape` = (C, H, W) sizes the first dense layer. Raises ValueError if a side is below `smallest_side`.

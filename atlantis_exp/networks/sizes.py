@@ -9,9 +9,9 @@ def check_sides(network: str, smallest: int, height: int, width: int) -> None:
         raise ValueError(f"{network} needs at least {smallest} pixels a side, not {height}x{width}")
 
 
-def convolved(side: int, kernel: int, stride: int, padding: int = 0) -> int:
+def convolved(side: int, kernel: int, stride: int) -> int:
     """Return the side of a convolution's feature map from the side of its input, in pixels."""
-    return (side + 2 * padding - kernel) // stride + 1
+    return (side - kernel) // stride + 1
 
 
 def count_parameters(network: nn.Module) -> int:

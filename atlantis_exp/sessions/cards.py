@@ -5,6 +5,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from textwrap import indent
 from typing import Annotated, Literal
 
 import numpy as np
@@ -199,7 +200,7 @@ Played with the weights of this folder, in float32{otherwise}.
 The interval is Student's 95 % of the mean over these episodes; it says nothing of trainings
 with other seeds. The network's policy: {evaluation.policy}.
 
-    {evaluation.report().replace(chr(10), chr(10) + "    ")}
+{indent(evaluation.report(), "    ")}
 
 ## Protocol
 
@@ -220,7 +221,7 @@ curve at or before the step.
 
 That of this repository (MIT), except for the sources of plugins. The weights were learned from the game as ale-py
 emulates it. They do not contain its ROM, which comes with ale-py under its own terms.
-""".replace("    \n", "\n")
+"""
 
 
 def _table(facts: dict[str, object]) -> str:

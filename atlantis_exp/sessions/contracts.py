@@ -33,6 +33,7 @@ from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.training import measure
+from atlantis_exp.terminal import quoted
 from atlantis_exp.tracking.store import first_line
 from atlantis_exp.training.checkpoint import Checkpoints, to_safetensors
 from atlantis_exp.training.fingerprint import fingerprint
@@ -297,7 +298,7 @@ def _resumes(small: Job) -> None:
 
 def _train(small: Job, outputs: Path, kill: bool = False) -> bool:
     """Train in a new process; with `kill`, kill it at the first commit. Return whether it was killed. Raises: Fault."""
-    own = replaced(small.overrides, f"paths.outputs={outputs}", "tracking.commit_seconds=1.0", "resume=auto")
+    own = replaced(small.overrides, f"paths.outputs={quoted(outputs)}", "tracking.commit_seconds=1.0", "resume=auto")
     command = (sys.executable, "-m", "atlantis_exp", "train", *own)
     with (
         tempfile.TemporaryFile("w+") as said,

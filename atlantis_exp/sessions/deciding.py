@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
+from heapq import heapreplace
+from itertools import pairwise, product
 from math import sqrt
 from pathlib import Path
 
@@ -29,12 +31,13 @@ from atlantis_exp.media import run_colour
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.comparing import Choice, compare
-from atlantis_exp.sessions.job import Job, command_line, labels, quoted, replaced
+from atlantis_exp.sessions.job import Job, labels, replaced
 from atlantis_exp.sessions.launchers import BASIC, Launcher
 from atlantis_exp.sessions.launchers.joblib import fitting
 from atlantis_exp.sessions.page import opened, terminable
 from atlantis_exp.sessions.sweep import how_many, sweep
 from atlantis_exp.sessions.training import measure, train
+from atlantis_exp.terminal import command_line, quoted
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.training.forecast import duration
 
@@ -151,7 +154,7 @@ class Contest:
             *([f"baseline={quoted(question.baseline)}"] if question.baseline is not None else []),
             *(["score=training", f"window={question.window:.12g}"] if question.score == "training" else []),
             *([f"error={question.error}"] if question.error != Question.error else []),
-            f"paths.outputs={quoted(str(self.outputs))}",
+            f"paths.outputs={quoted(self.outputs)}",
         )
 
     def job(self, label: str, seed: int) -> Job:
@@ -267,19 +270,25 @@ def say_what_it_takes(contest: Contest) -> None:
         f"{', '.join(contest.contenders)}: {fewest}{count * looks[-1]} runs, looks at "
         f"{' and '.join(map(str, looks))} seeds each; {count * looks[-1] - sum(missing.values())} exist."
     )
-    launcher, hours = BASIC if contest.launcher else contest.here, 0.0
+    launcher, forecasts = BASIC if contest.launcher else contest.here, dict[str, float]()
     cores = launcher.settings.get("cores")
     if not contest.launcher:
         say(how_many(launcher))
     for label, runs in missing.items():
         if runs and contest.config.budget.forecast != "off":
-            forecast = measure(contest.job(label, 0), cores)[1].hours
-            hours += runs * forecast
-            say(f"{label}: {duration(forecast)} a run, {'on its share' if cores else 'alone on this machine'}")
-    if hours:
-        at_once = launcher.settings.get("n_jobs", 1)
+            forecasts[label] = measure(contest.job(label, 0), cores)[1].hours
+            where = "on its share" if cores else "alone on this machine"
+            say(f"{label}: {duration(forecasts[label])} a run, {where}")
+    if forecasts:
+        at_once, hours = launcher.settings.get("n_jobs", 1), 0.0
+        for span in pairwise((0, *looks)):
+            ends = [hours] * at_once  # of the trainings side by side; a look waits for the last
+            for seed, label in product(range(*span), forecasts):
+                if contest.left(label, [seed]):
+                    heapreplace(ends, ends[0] + forecasts[label])
+            hours = max(ends)
         how = "side by side" if at_once > 1 else "one after the other"
-        say(f"at most {duration(hours / at_once)} {how}, evaluations not counted")
+        say(f"at most {duration(hours)} {how}, evaluations not counted")
     if (known := _spread(contest)) is None:
         return
     spread, whence = known

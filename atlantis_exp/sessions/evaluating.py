@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 from atlantis_exp import terminal
@@ -203,7 +204,7 @@ def _record(
         folder.write_config(facts)
         journal.params({key: str(value) for key, value in flatten(facts).items()})
         journal.tags({**provenance(command), "policy": evaluation.policy})
-        journal.note(f"    {evaluation.report().replace(chr(10), chr(10) + '    ')}")
+        journal.note(indent(evaluation.report(), "    "))
         step = int(facts.get("step", 0))
         journal.metrics(evaluation.metrics(), step)
         for index, episode in enumerate(evaluation.episodes):

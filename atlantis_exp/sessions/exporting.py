@@ -46,7 +46,7 @@ def export(
     folder = absolute("to", str(typed))
     if folder == Path.cwd():  # the export takes its place, and a shell would be left in none
         raise ConfigError(f"to={to}: the folder that you are in; name another")
-    check_new("to", folder)
+    check_new(folder)
     trained = portable(source.trained_config)
     stored, step = stored_weights(source, weights)
     packed, precision = pack(stored)

@@ -1,7 +1,5 @@
 """Describe a training that was asked for: its config, title and command."""
 
-import re
-import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
@@ -9,7 +7,7 @@ from pathlib import Path
 
 from atlantis_exp.config import Config
 from atlantis_exp.machine import Machine, here
-from atlantis_exp.terminal import PROGRAM
+from atlantis_exp.terminal import command_line
 
 
 @dataclass(frozen=True)
@@ -59,19 +57,6 @@ def replaced(overrides: Iterable[str], *others: str) -> list[str]:
     """Return overrides with some replaced or added."""
     keys = {text.partition("=")[0] for text in others}
     return [*(text for text in overrides if text.partition("=")[0] not in keys), *others]
-
-
-def command_line(*arguments: str) -> str:
-    """Return one of our commands, quoted for a shell."""
-    return " ".join((PROGRAM, *map(shlex.quote, arguments)))
-
-
-def quoted(value: str) -> str:
-    """Quote a text for Hydra if needed."""
-    if re.fullmatch(r"[\w/.+-]+", value, re.ASCII):
-        return value
-    escaped = value.replace("'", r"\'")
-    return f"'{escaped}'"
 
 
 def config_colour(config: Config) -> str:

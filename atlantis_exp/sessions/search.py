@@ -37,10 +37,11 @@ from atlantis_exp.runs.files import ARTIFACT, own, read_file
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Metrics, Status, adopt
 from atlantis_exp.runs.lock import alone
-from atlantis_exp.sessions.job import Job, command_line, fitted, labels, replaced
+from atlantis_exp.sessions.job import Job, fitted, labels, replaced
 from atlantis_exp.sessions.page import ending, opened
 from atlantis_exp.sessions.stopping import StopRequest
 from atlantis_exp.sessions.training import train
+from atlantis_exp.terminal import command_line
 from atlantis_exp.tracking.store import first_line
 from atlantis_exp.training.trainer import Trainer
 

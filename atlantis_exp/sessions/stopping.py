@@ -19,9 +19,9 @@ _LOOK_SECONDS = 1.0  # between two checks that the sweep goes on
 class StopRequest:
     """A flag that the trainer polls, set by SIGINT, SIGTERM, SIGUSR2, the end of the time or of the sweep.
 
-    Time counts from the first poll, after the first step, so that a session with a long set-up makes progress. A second
-    SIGINT ends the process at once; the last commit stays. Under Slurm SIGTERM is a warning: the run commits and goes
-    on, since Slurm itself requeues or kills it.
+    Time counts from the first poll, after the first step, so that a session with a long set-up makes progress. A SIGINT
+    after another signal ends the process at once; the last commit stays. Under Slurm SIGTERM is a warning: the run
+    commits and goes on, since Slurm itself requeues or kills it.
     """
 
     def __init__(

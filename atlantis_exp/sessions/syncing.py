@@ -26,16 +26,14 @@ class Sent(NamedTuple):
 def sync(
     *,
     to: str | None,
-    every: str | int | None,
-    seconds: int | None,
+    every: int | None,
     tracking: TrackingConfig,
     paths: PathsConfig,
     wait: Callable[[float], object] = time.sleep,
 ) -> None:
     """Publish all run folders, once or until interrupted; print changed runs and counts.
 
-    Raises: Fault if the store cannot be reached or a run failed. With `every`, and its `seconds`, it warns and tries
-    again.
+    Raises: Fault if the store cannot be reached or a run failed. With `every`, in seconds, it warns and tries again.
     """
     outputs = Path(paths.outputs)
     store = Store(outputs, tracking.experiment, to or tracking.uri)
@@ -45,13 +43,13 @@ def sync(
             try:
                 tell(store.uri, publish_all(outputs, store), is_first)
             except Fault as fault:
-                if seconds is None:
+                if every is None:
                     raise
-                terminal.warn(f"{fault}; trying again in {every}")
-            if seconds is None:
+                terminal.warn(f"{fault}; trying again in {every} s")
+            if every is None:
                 return
             is_first = False
-            wait(seconds)
+            wait(every)
     except KeyboardInterrupt:
         sys.exit(130)  # 128 + SIGINT; sent runs are recorded
 

@@ -17,15 +17,17 @@ from atlantis_exp import terminal
 from atlantis_exp.build import build_trained_network, build_trainer, choose_device, described, import_components
 from atlantis_exp.checking import absolute, flatten, to_dict
 from atlantis_exp.config import Config
-from atlantis_exp.faults import ConfigError, Fault, RunFault, in_words
+from atlantis_exp.faults import ConfigError, Fault, in_words
+from atlantis_exp.game.vector import WorkerDied
 from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import CONFIG, LOST, TRACEBACK, Result, RunFolder, all_runs
 from atlantis_exp.runs.journal import Journal, Tracker, adopt, has_lost_commit
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.cards import read_card
-from atlantis_exp.sessions.job import Job, command_line, labels, replaced
+from atlantis_exp.sessions.job import Job, labels, replaced
 from atlantis_exp.sessions.processor import processor_name, set_up_torch
 from atlantis_exp.sessions.stopping import StopRequest, sweep_goes_on
+from atlantis_exp.terminal import command_line, quoted
 from atlantis_exp.tracking.publishing import catch_up, publishing
 from atlantis_exp.training.checkpoint import unforged
 from atlantis_exp.training.forecast import Forecast, forecast
@@ -194,7 +196,7 @@ def _kin(job: Job, folder: RunFolder) -> str:
     config, science = job.config, job.config.science()
     alike = folder.name.rpartition("-")[0]
     for other in all_runs(folder.path.parents[1]):
-        if other.name.startswith(f"{alike}-") and other.name != folder.name:
+        if other.name.startswith(f"{alike}-") and "~" not in other.name and other.name != folder.name:
             with suppress(Fault):
                 trained = other.trained_config
                 theirs = trained.science()
@@ -217,7 +219,7 @@ def _begin_with(job: Job, folder: RunFolder) -> str:
     """Return the commands that begin a training with a run's weights."""
     weights = f"pretrained/{folder.name}"
     own = [text for text in job.overrides if not text.startswith(("budget.steps=", "budget.flops="))]
-    export = command_line("export", f"run={folder.name}", f"to={weights}", f"paths.outputs={job.outputs}")
+    export = command_line("export", f"run={folder.name}", f"to={weights}", f"paths.outputs={quoted(job.outputs)}")
     begin = command_line(*replaced(own, f"training.weights={weights}"))
     return f"To begin a training with its weights:\n  {export}\n  {begin}"
 
@@ -237,14 +239,7 @@ def measure(
 
 def _expected(trainer: Trainer, config: Config, done: Counters) -> Forecast:
     """Return the cost of the rest of a training; leave its parts unchanged."""
-    return forecast(
-        trainer,
-        capacity=config.replay.capacity,
-        max_bytes=config.replay.max_bytes,
-        size=config.env.size,
-        lags=config.env.lags,
-        done=done,
-    )
+    return forecast(trainer, capacity=config.replay.capacity, max_bytes=config.replay.max_bytes, done=done)
 
 
 def _check_forecast(trainer: Trainer, config: Config, done: Counters, progress: Progress) -> None:
@@ -266,7 +261,7 @@ def _faults_recorded(job: Job, folder: RunFolder, journal: Journal) -> Iterator[
         with suppress(OSError):  # the disk may be full; the next command sees that no process holds the run
             write_file(folder.path / TRACEBACK, traceback.format_exc().encode())
             journal.status("FAILED", str(error) or type(error).__name__)
-        if isinstance(error, RunFault | OSError):
+        if isinstance(error, WorkerDied | OSError):
             reason = in_words(error) if isinstance(error, OSError) else error
             raise Fault(f"run {folder.name}: {reason}; continue with: {job.command}") from error
         if job.config.compile and _is_of_compilation(error):

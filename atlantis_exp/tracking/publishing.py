@@ -8,14 +8,13 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from shlex import quote
 
 from atlantis_exp import terminal
 from atlantis_exp.config import TrackingConfig
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder, all_folders
 from atlantis_exp.runs.journal import Journal, read_commit
-from atlantis_exp.terminal import PROGRAM
+from atlantis_exp.terminal import command_line, quoted
 from atlantis_exp.tracking.local import DATABASE
 from atlantis_exp.tracking.mirror import PRIMARY, Cursor, digest, noted, publish
 from atlantis_exp.tracking.store import Store, first_line
@@ -28,21 +27,23 @@ _DRAIN_SECONDS = 20.0  # to wait for MLflow at a command's end; `catch_up` sends
 class Publisher:
     """Publish the commits of run folders every `interval` seconds in a thread, without disturbing the runs.
 
-    While MLflow fails, it backs off to one try a minute.
+    While MLflow fails, it backs off to one try a minute, or a second while a drain waits.
     """
 
     def __init__(self, folder: Path, store: Store, interval: float = 5.0, others: Sequence[Path] = ()) -> None:
         self._folders = (folder, *others)
         self._store = store
         self._interval = interval
-        self._draining = threading.Event()
+        self._draining, self._awaited = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="publisher", daemon=True)
         self._thread.start()
 
     def drain(self, timeout: float) -> bool:
         """Publish the commits so far and stop; return False if that takes more than `timeout` seconds."""
+        self._awaited.set()
         self._draining.set()
         self._thread.join(timeout)
+        self._awaited.clear()
         return not self._thread.is_alive()
 
     def _run(self) -> None:
@@ -71,10 +72,10 @@ class Publisher:
                 delay, failing = self._interval, False
                 if draining:
                     return
-            if draining:
-                time.sleep(1.0)
-            else:
+            if not draining:
                 self._draining.wait(delay)
+            elif self._awaited.wait(delay):
+                time.sleep(1.0)
 
 
 @contextmanager
@@ -151,7 +152,7 @@ def catch_up(
             if not Publisher(folder.path, store).drain(seconds):
                 unreachable.add(store.address)
     for uri, runs in left.items():
-        terminal.warn(f"{uri} lacks parts of {runs} runs; {PROGRAM} sync {quote(f'to={uri}')} sends them")
+        terminal.warn(f"{uri} lacks parts of {runs} runs; {command_line('sync', f'to={quoted(uri)}')} sends them")
 
 
 def lacking(outputs: Path) -> list[RunFolder]:
@@ -169,5 +170,5 @@ def how_to_open(outputs: Path) -> str:
     if not missing and not (outputs / DATABASE).exists():
         return ""
     shown = outputs.relative_to(Path.cwd()) if outputs.is_relative_to(Path.cwd()) else outputs
-    command = f"{PROGRAM} ui {quote(f'paths.outputs={shown}')}"
+    command = command_line("ui", f"paths.outputs={quoted(shown)}")
     return f"\nthe MLflow UI: {command}{f' (publishes {missing:,} runs that it lacks first)' if missing else ''}\n"

@@ -6,7 +6,6 @@ import sqlite3
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from shlex import quote
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypeVar, cast
 
@@ -14,7 +13,7 @@ from atlantis_exp import terminal
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.journal import Commit
 from atlantis_exp.runs.lock import alone
-from atlantis_exp.terminal import PROGRAM
+from atlantis_exp.terminal import command_line, quoted
 from atlantis_exp.tracking import local
 from atlantis_exp.tracking.local import DATABASE, Point
 from atlantis_exp.tracking.server import PatientClient, TooSlow
@@ -22,7 +21,7 @@ from atlantis_exp.tracking.views import experiment_tags
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-    from mlflow.entities import LoggedModel, Run
+    from mlflow.entities import Run
     from mlflow.store.entities import PagedList
 
 P = TypeVar("P")
@@ -71,10 +70,6 @@ class Store:
         """Return the published runs, the latest first."""
         return all_pages(partial(self.client.search_runs, [self.experiment_id], f"tags.`{FOLDER}` != ''"))
 
-    def models(self, run_id: str) -> "list[LoggedModel]":
-        same = f"source_run_id = '{run_id}'"
-        return all_pages(partial(self.client.search_logged_models, [self.experiment_id], same))
-
     def prepare(self) -> None:
         """Write the experiment's description and shared views."""
         comparisons = "tags.`atlantis.kind` = 'comparison'"
@@ -107,7 +102,8 @@ class Store:
 
     def delete_run(self, run_id: str) -> None:
         """Delete a run, and its models, which MLflow would keep."""
-        for model in self.models(run_id):
+        same = f"source_run_id = '{run_id}'"
+        for model in all_pages(partial(self.client.search_logged_models, [self.experiment_id], same)):
             self.client.delete_logged_model(model.model_id)
         self.client.delete_run(run_id)
 
@@ -157,7 +153,7 @@ class Store:
         reason = first_line(error)
         if not self._is_unusable(error):
             return Fault(f"{self.uri} cannot be reached: {reason}")
-        again = f"{PROGRAM} sync {quote(f'paths.outputs={self._root}')}"
+        again = command_line("sync", f"paths.outputs={quoted(self._root)}")
         return Fault(f"{self._root / DATABASE} cannot be used ({reason}): move it away, and {again} rebuilds it")
 
     def _is_unusable(self, error: Exception) -> bool:

@@ -111,11 +111,11 @@ def _start_here() -> dict[str, Any]:
     charts = [
         _line("score", "score/mean_100"),
         _line("score", "score/episode"),
-        _bar("evaluation", "evaluation/interquartile_mean"),
+        _chart("BAR", "evaluation", metricKey="evaluation/interquartile_mean"),
         _line("evaluation", "evaluation/mean"),
         _chart("PARALLEL", "evaluation", **parallel),  # not among groups, which have only numbers for params
-        _images("pictures", "score/histogram", "score/heatmap"),
-        _images("pictures", "evaluation/histogram"),
+        _images("score/histogram", "score/heatmap"),
+        _images("evaluation/histogram"),
         _line("actions", "actions/epsilon"),
         _line("actions", "actions/network_share"),
         _line("learning", "learning/loss"),
@@ -133,7 +133,7 @@ def _start_here() -> dict[str, Any]:
 
 def _sweep() -> dict[str, Any]:
     charts = [
-        _bar("evaluation", "evaluation/interquartile_mean"),
+        _chart("BAR", "evaluation", metricKey="evaluation/interquartile_mean"),
         _line("evaluation", "evaluation/mean"),
         _line("score", "score/mean_100"),
     ]
@@ -163,7 +163,7 @@ def _page(view: str, charts: list[dict[str, Any]]) -> dict[str, Any]:
     ]
     # MLflow adds a chart for a picture that has none of its own; a deleted one prevents it.
     covered = {key for chart in charts for key in chart.get("imageKeys", [])}
-    charts = [*charts, *({**_images("pictures", key), "deleted": True} for key in sorted(covered))]
+    charts = [*charts, *({**_images(key), "deleted": True} for key in sorted(covered))]
     return {
         "selectedColumns": list(_COLUMNS),
         "runsExpanded": {},
@@ -193,12 +193,8 @@ def _line(section: str, key: str) -> dict[str, Any]:
     return _chart("LINE", section, metricKey=key, selectedMetricKeys=[key], lineSmoothness=0, **axes)
 
 
-def _bar(section: str, key: str) -> dict[str, Any]:
-    return _chart("BAR", section, metricKey=key)
-
-
-def _images(section: str, *keys: str) -> dict[str, Any]:
-    return _chart("IMAGE", section, imageKeys=list(keys), step=0, showRunParams=False)
+def _images(*keys: str) -> dict[str, Any]:
+    return _chart("IMAGE", "pictures", imageKeys=list(keys), step=0, showRunParams=False)
 
 
 def _chart(kind: str, section: str, **settings: Any) -> dict[str, Any]:

@@ -5,7 +5,7 @@ import math
 import shutil
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,16 +65,14 @@ class Forecast:
         return None
 
 
-def forecast(
-    trainer: Trainer, *, capacity: int, max_bytes: int, size: int, lags: Sequence[int], done: Counters
-) -> Forecast:
+def forecast(trainer: Trainer, *, capacity: int, max_bytes: int, done: Counters) -> Forecast:
     """Time emulation, acting and learning with a trainer's parts, and restore all but the emulators.
 
-    Call it before their episodes begin or are loaded. capacity in observations, max_bytes of the replay memory, size in
-    pixels. Assumes that future episodes are as long as past ones, or as the game's usual ones.
+    Call it before their episodes begin or are loaded. capacity in observations, max_bytes of the replay memory.
+    Assumes that future episodes are as long as past ones, or as the game's usual ones.
     """
     plan, learner, emulators = trainer.plan, trainer.learner, trainer.emulators
-    num_envs = emulators.num_envs
+    num_envs, lags, size = emulators.num_envs, trainer.memory.lags, trainer.stack.state.shape[-1]
     rng = np.random.default_rng(0)
     available = psutil.virtual_memory().available  # before the updates, which keep theirs
     # The states of a batch as bytes and float32, and what the first layer makes of them.

@@ -6,6 +6,9 @@ from typing import Any
 
 import pytest
 from hydra import compose
+from hydra.core.override_parser.types import QuotedString
+from hypothesis import example, given
+from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from atlantis_exp.commands import VERBS
@@ -24,6 +27,7 @@ from atlantis_exp.commands.sync import SyncConfig
 from atlantis_exp.commands.ui import UiConfig
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
+from atlantis_exp.terminal import quoted
 
 SCHEMAS: dict[str, type[Any]] = {
     "config": Config,
@@ -135,6 +139,10 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("env.num_envs=4 env.stack=[0,24] training.learn_start=999_900", "training.learn_start=999900", "than 999896"),
     ("env.crop=[90,160,90,0]", "env.crop=[90, 160, 90, 0]", "UP < DOWN <= 210"),
     ("env.crop=[0,161,210,0]", "env.crop", "RIGHT <= 160"),
+    ("env.crop=[0,160,211,0]", "env.crop", "DOWN <= 210"),
+    ("env.crop=[-1,160,210,0]", "env.crop", "0 <= UP"),
+    ("env.crop=[0,160,210,-1]", "env.crop", "0 <= LEFT"),
+    ("env.crop=[0,80,210,80]", "env.crop", "LEFT < RIGHT"),
     ("env.crop=[-1,160,210,0]", "env.crop", "0 <= UP"),
     ("env.size=35", "env.size=35", "at least 36"),
     ("model.head=quantile", "model.head=quantile", "objective.name=dqn"),
@@ -294,13 +302,26 @@ def test_what_is_right_passes(line: str) -> None:
     check("config", Config, re.findall(r"(?:[^ ']|'[^']*')+", line))
 
 
+@given(st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1).filter(lambda text: "${" not in text))
+@example("Müller (1)")
+@example("cnn~1")
+@example("nan")
+@example("12")
+@example("postgresql://u@h/d")
+@example('\\"\\')
+def test_a_printed_command_holds_the_value(text: str) -> None:
+    value = read_override(f"key={quoted(text)}").value()
+    assert str(value.text if isinstance(value, QuotedString) else value) == text
+
+
 def test_a_sweep_kept_in_a_file_is_the_one_typed_out(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(
         "model: [cnn, resnet]\noptimizer: {lr: [1e-3, 0.0001]}\nseed: range(0,2)\nenv.crop: [[0, 160, 210, 0]]\n"
         "budget.steps: 100\nthreads: null\n"
     )
     texts = ["model=cnn,resnet", "optimizer.lr=1e-3,0.0001", "seed=range(0,2)", "env.crop=[0, 160, 210, 0]"]
-    found = located(["-m", f"sweep={tmp_path / 'mine.yaml'}", "threads=1"])
+    (tmp_path / "link.yaml").symlink_to(tmp_path / "mine.yaml")
+    found = located(["-m", f"sweep={tmp_path / 'link.yaml'}", "threads=1"])
     assert found == ["-m", *texts, "budget.steps=100", "threads=null", "threads=1"]
     assert len(check("config", Config, found[:-1])) == 8
 

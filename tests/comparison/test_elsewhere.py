@@ -15,7 +15,9 @@ def table(folder: Path, text: str) -> Path:
 
 def test_rows_of_a_seed_are_averaged_and_further_columns_not_read(tmp_path: Path) -> None:
     path = table(tmp_path, "\ufeffseed,group,score,step\n3,b,4,x\n1,a,-1.5,\n3,b,5,y\n0,b, 7e1 ,\n")
-    one, other = read_scores(path, {})
+    link = tmp_path / "link.csv"
+    link.symlink_to(path)
+    one, other = read_scores(link, {})
     assert (one.label, one.seeds) == ("a", {1: -1.5})
     assert (other.label, other.seeds) == ("b", {0: 70.0, 3: 4.5})
     assert list(other.seeds) == [0, 3]

@@ -94,18 +94,6 @@ def test_a_crop_counts_up_right_down_left_from_the_top_left(data: st.DataObject)
     assert not np.shares_memory(cut, screen)  # the emulator draws the next one in its place
 
 
-@pytest.mark.parametrize(
-    "crop",
-    [
-        *((0, 160, 211, 0), (-1, 160, 210, 0), (0, 161, 210, 0), (0, 160, 210, -1)),
-        *((90, 160, 90, 0), (0, 80, 210, 80), (210, 160, 0, 0), (0, 0, 210, 160)),
-    ],
-)
-def test_a_crop_that_is_empty_or_beyond_the_screen_is_refused(crop: tuple[int, int, int, int]) -> None:
-    with pytest.raises(ValueError, match="not inside a 210x160 screen"):
-        Preprocessing(84, crop)
-
-
 def frames(*values: int) -> Pixels:
     return np.stack([np.full((2, 2), value, np.uint8) for value in values])
 

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -22,6 +23,7 @@ from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.machine import all_cores
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import NOTE, Tags
+from atlantis_exp.sessions import deciding as deciding_module
 from atlantis_exp.sessions.deciding import Contest, decide, say_what_it_takes
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.launchers import BASIC, Launcher
@@ -341,6 +343,19 @@ def test_before_it_starts_it_says_how_many_runs_there_may_be_and_what_they_can_f
         "by sampler, a difference of 14 % of the score",
         "by model,sampler, a difference of 27 % of the score",
     ]
+
+
+def test_a_look_waits_for_its_last_run(
+    asking: Asking, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hours = {"cnn": 1.0, "resnet_fast": 2.0}
+    monkeypatch.setattr(
+        deciding_module, "measure", lambda job, _: (None, SimpleNamespace(hours=hours[job.config.model.name]))
+    )
+    contest = asking("model=cnn,resnet_fast", "budget.forecast=warn")
+    for at_once, most in ((4, "10.0 hours side by side"), (1, "30.0 hours one after the other")):
+        contest.here = Launcher("joblib", {"n_jobs": at_once, "cores": 2})
+        assert f"at most {most}, evaluations not counted" in said(contest, capsys)
 
 
 @pytest.mark.slow

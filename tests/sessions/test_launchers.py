@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
@@ -107,7 +108,7 @@ def test_the_launcher_of_a_command_line_is_known_and_a_wrong_setting_is_one_line
     words = ["seed=0,1", "hydra/launcher=joblib", "hydra.launcher.n_jobs=3"]
     assert launcher(["-m", "seed=0,1"]) == BASIC
     assert launcher(["-m", *words]) == Launcher("joblib", {"n_jobs": 3})
-    with pytest.raises(ConfigError, match=r"^hydra.launcher.n_jobs=many: should be a number, as -1$"):
+    with pytest.raises(ConfigError, match=r"^hydra.launcher.n_jobs=many: should be an integer, as -1$"):
         launcher(["-m", "seed=0,1", "hydra/launcher=joblib", "hydra.launcher.n_jobs=many"])
     with pytest.raises(ConfigError, match=r"n_jbos=3: no such key; did you mean 'hydra.launcher.n_jobs'"):
         check("config", Config, ["-m", "seed=0,1", "hydra/launcher=joblib", "hydra.launcher.n_jbos=3"])
@@ -221,6 +222,10 @@ def test_a_training_has_as_many_cores_when_it_goes_on_after_others_have_ended(
     jobs = [Job(tiny(f"seed={seed}")) for seed in range(4)]
     assert fitting(jobs, 4) == fitting(jobs[:1], 4) == Launcher("joblib", {"n_jobs": 4, "cores": 2})
     assert fitting(jobs[:1], 1) == BASIC
+    with monkeypatch.context() as beside_another_program:
+        memory = SimpleNamespace(total=2**40, available=2**30)
+        beside_another_program.setattr("psutil.virtual_memory", lambda: memory)
+        assert fitting(jobs, 4) == Launcher("joblib", {"n_jobs": 1, "cores": 2})
     told: list[str] = []
 
     class Ends(FakeProcess):

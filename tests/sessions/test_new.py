@@ -14,6 +14,7 @@ from atlantis_exp.commands import CHECKOUT, CONF
 from atlantis_exp.commands.overrides import check
 from atlantis_exp.components import ENTRY_POINTS, KINDS, admit
 from atlantis_exp.config import Config
+from atlantis_exp.faults import Fault
 from atlantis_exp.sessions.contracts import contracts_of
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.new import EXAMPLES, begin
@@ -80,7 +81,9 @@ def test_a_wheel_brings_the_examples_that_packages_are_made_of() -> None:
 
 
 def test_what_is_written_is_whole_or_not_there(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="name too long"):  # once the first files are written
+    with pytest.raises(
+        Fault, match=r"^to=.*new: .*name too long.*; make room there, or name another folder$"
+    ):  # once the first files are written
         begin("model", 300 * "x", tmp_path / "new", CONF.parent / "examples")
     assert [*tmp_path.iterdir()] == []
 

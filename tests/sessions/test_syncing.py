@@ -51,7 +51,7 @@ def config_of(outputs: Path, *overrides: str) -> SyncConfig:
 
 def synced(outputs: Path, *overrides: str) -> None:
     config = config_of(outputs, *overrides)
-    sync(**vars(config), seconds=config.seconds)
+    sync(**{**vars(config), "every": config.seconds})
 
 
 def png(grey: int) -> bytes:
@@ -195,7 +195,7 @@ def test_a_folder_that_names_a_server_is_not_sent_there_with_the_password(
         time.sleep(0.05)
     (run / "published.json").write_text(json.dumps({"store": "http://h/$(x)#atlantis", "identity": "x"}))
     catch_up(tmp_path, uri, seconds=0.5)
-    assert "sync 'to=http://h/$(x)' sends them" in capsys.readouterr().err
+    assert "sync 'to=\"http://h/$(x)\"' sends them" in capsys.readouterr().err
 
 
 def test_every_folder_of_the_outputs_is_published_and_stays_at_home(tmp_path: Path) -> None:
@@ -240,12 +240,12 @@ def test_it_looks_again_and_says_only_what_changed_until_it_is_interrupted(
 
     config = config_of(tmp_path, "every=30s")
     with pytest.raises(SystemExit, match="130"):
-        sync(**vars(config), seconds=config.seconds, wait=wait)
+        sync(**{**vars(config), "every": config.seconds}, wait=wait)
     first, second, third = told
     assert first.endswith(": 2 runs: 2 published\n")
     assert second == ""
     assert "1 failed, 1 up to date" in third
-    assert third.endswith("1 of 2 runs failed; trying again in 30s\n")
+    assert third.endswith("1 of 2 runs failed; trying again in 30 s\n")
 
 
 def test_a_store_that_fails_in_the_middle_ends_it_and_a_folder_that_fails_does_not(tmp_path: Path) -> None:

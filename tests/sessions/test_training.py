@@ -157,6 +157,12 @@ def test_a_longer_plan_says_which_run_is_the_same_over_a_shorter_one_and_why_it_
     assert _kin(Job(tiny("seed=1")), RunFolder.of(tiny("seed=1"))) == ""
 
 
+def test_a_run_that_was_put_aside_has_no_other_plan(tiny: Compose, recorded: Callable[..., Path]) -> None:
+    folder = RunFolder(recorded())
+    folder.put_aside()
+    assert _kin(Job(tiny()), folder) == ""
+
+
 def test_a_budget_that_cuts_a_schedule_says_so(tiny: Compose, capsys: pytest.CaptureFixture[str]) -> None:
     fixed = ("epsilon=constant", "epsilon.value=0.1", "evaluation.at_end=false")
     train(Job(tiny(*SHORT, "budget.steps=20", *fixed, "lr_schedule=linear")))

@@ -96,7 +96,7 @@ def test_slurm_where_there_is_none_and_wrong_settings_are_one_line(
     assert refusal("hydra.launcher.partion=x").startswith(
         "hydra.launcher.partion=x: no such key; did you mean 'hydra.launcher.partition'?"
     )
-    assert refusal("hydra.launcher.timeout_min=abc") == "hydra.launcher.timeout_min=abc: should be a number, as 240"
+    assert refusal("hydra.launcher.timeout_min=abc") == "hydra.launcher.timeout_min=abc: should be an integer, as 240"
 
 
 @pytest.mark.skipif(not HAS_PLUGIN, reason="no submitit: pip install -e '.[slurm]'")

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import closing
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
@@ -121,7 +122,7 @@ def test_a_command_publishes_its_run_and_others_and_says_where_it_could_not(
 
 def test_the_way_to_the_ui_says_how_many_runs_the_store_lacks(tmp_path: Path) -> None:
     outputs = tmp_path / "a b"
-    command = f"\nthe MLflow UI: python -m atlantis_exp ui 'paths.outputs={outputs}'"
+    command = f"\nthe MLflow UI: python -m atlantis_exp ui 'paths.outputs=\"{outputs}\"'"
     assert how_to_open(outputs) == ""
     runs = [outputs / "runs" / name for name in ("first", "second")]
     for folder in runs:
@@ -233,6 +234,24 @@ def test_everything_arrives_after_another_writer_held_the_database(tmp_path: Pat
         writer.execute("ROLLBACK")
     assert publisher.drain(120)
     assert everything(root, tmp_path)["metrics"] == journaled_points(tmp_path)
+
+
+def test_a_publisher_that_nobody_waits_for_tries_less_and_less_often(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried = threading.Semaphore(0)
+
+    def fail(*_: object) -> None:
+        tried.release()
+        raise Fault("out of reach")
+
+    monkeypatch.setattr(publishing, "publish", fail)
+    publisher = Publisher(tmp_path, Store(tmp_path), interval=120)
+    assert not publisher.drain(0.5)  # one try at once, one in a second
+    tries = list(takewhile(bool, (tried.acquire(timeout=3) for _ in range(9))))
+    assert 2 <= len(tries) <= 3
+    monkeypatch.setattr(publishing, "publish", lambda *_: None)
+    assert publisher.drain(30)  # wakes it
 
 
 def test_a_store_out_of_reach_is_reported_once_and_caught_up_with_once_it_is_back(

@@ -36,9 +36,9 @@ def timed(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
     return asked
 
 
-def expected_of(trainer: Trainer, size: int, **chosen: Any) -> Forecast:
+def expected_of(trainer: Trainer, **chosen: Any) -> Forecast:
     asked = {"capacity": 120, "max_bytes": 2**22, "done": trainer.counters}
-    return forecast(trainer, size=size, lags=range(4), **{**asked, **chosen})
+    return forecast(trainer, **{**asked, **chosen})
 
 
 @pytest.mark.parametrize(("num_envs", "remembers"), [(1, False), (3, False), (2, True)])
@@ -51,7 +51,7 @@ def test_a_training_with_a_forecast_is_bit_for_bit_the_one_without(
         trainer = small(tmp_path / name, num_envs=num_envs, remembers=remembers, phases=phases)
         if name == "with":
             assert trainer.learner.update_flops((4, 8, 8), 4) > 0
-            expected_of(trainer, 8)
+            expected_of(trainer)
         trainer.run()
         prints.append(fingerprint(trainer.state_dict(), trainer.memory, tmp_path / name))
         histories.append(history(tmp_path / name))
@@ -81,7 +81,7 @@ def test_a_step_is_measured_with_its_schedules(
         return 1e-3
 
     monkeypatch.setattr(forecast_module, "_median_seconds", median_seconds)
-    expected_of(trainer, 8)
+    expected_of(trainer)
     assert during == [1, 0, 0]  # to play, to act, to learn
 
 
@@ -89,7 +89,7 @@ def test_a_network_with_a_memory_sees_every_state_and_needs_room_for_sequences(
     small: Callable[..., Trainer], tmp_path: Path
 ) -> None:
     trainer = small(tmp_path, num_envs=2, epsilon=lambda *_: 0.5, learn_every=4, remembers=True)
-    expected = expected_of(trainer, 8, max_bytes=1_000)
+    expected = expected_of(trainer, max_bytes=1_000)
     assert expected.steps_per_second == pytest.approx(1 / ((1e-3 + 1e-3) / 2 + 1e-3 / 4))
     assert expected.memory == 1_000 + 2**29 + 12 * 4 * (2 + 16 + 1) * 4 * 8 * 8
 
@@ -107,7 +107,7 @@ def test_sequences_that_do_not_fit_are_measured_by_a_part_of_them(
 
     monkeypatch.setattr(type(trainer.plan), "gather", counted)
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=5 * a_sequence))
-    expected = expected_of(trainer, 8)
+    expected = expected_of(trainer)
     assert {*sizes} == {2}  # of four: they take at most half of the memory
     assert expected.updates_per_second == pytest.approx(1 / 2e-3)
     assert (expected.shortage or "").startswith("memory will not suffice")
@@ -115,29 +115,29 @@ def test_sequences_that_do_not_fit_are_measured_by_a_part_of_them(
 
 def test_what_is_left_is_expected_of_a_training(small: Callable[..., Trainer], tmp_path: Path) -> None:
     trainer = small(tmp_path, num_envs=2, epsilon=lambda *_: 0.5, learn_every=4, evaluate_steps=None)
-    whole = expected_of(trainer, 8)
+    whole = expected_of(trainer)
     seconds_a_step = (1e-3 + 0.75 * 1e-3) / 2 + 1e-3 / 4
     assert whole.steps == 160
     assert whole.steps_per_second == pytest.approx(1 / seconds_a_step)
     assert whole.hours == pytest.approx(160 * seconds_a_step / 3600)
-    assert expected_of(trainer, 8, done=Counters(steps=100)).steps == 60
-    assert expected_of(small(tmp_path, max_steps=50), 8, done=Counters(steps=20)).steps == 30
-    assert expected_of(small(tmp_path, max_updates=5), 8, done=Counters(steps=30)).steps == 20 + 5 * 4 - 30
-    assert expected_of(small(tmp_path, max_updates=5, max_steps=35), 8).steps == 35
-    assert expected_of(trainer, 8, done=Counters(steps=500)).steps == 1
+    assert expected_of(trainer, done=Counters(steps=100)).steps == 60
+    assert expected_of(small(tmp_path, max_steps=50), done=Counters(steps=20)).steps == 30
+    assert expected_of(small(tmp_path, max_updates=5), done=Counters(steps=30)).steps == 20 + 5 * 4 - 30
+    assert expected_of(small(tmp_path, max_updates=5, max_steps=35)).steps == 35
+    assert expected_of(trainer, done=Counters(steps=500)).steps == 1
     trainer.plan = replace(trainer.plan, unit="episodes")
-    assert expected_of(trainer, 8).steps == 160 * trainer.emulators.game.episode_steps
+    assert expected_of(trainer).steps == 160 * trainer.emulators.game.episode_steps
     for episodes, left in ((40, 120), (159, 1), (160, 0)):  # which have been longer than the game's usual ones
         done = Counters(steps=5_000 * episodes, episodes=episodes)
-        assert expected_of(trainer, 8, done=done).steps == max(1, 5_000 * left)
+        assert expected_of(trainer, done=done).steps == max(1, 5_000 * left)
     trainer.plan = replace(trainer.plan, unit="steps")
-    assert expected_of(trainer, 8, max_bytes=1_000).memory == 1_000 + 2**29
+    assert expected_of(trainer, max_bytes=1_000).memory == 1_000 + 2**29
     weights = sum(tensor.nbytes for tensor in trainer.learner.network.state_dict().values())
     for due, evaluations in (
         ({"evaluate_steps": 2}, 80),
         ({"evaluate_steps": None, "evaluate_episodes": 1}, 160 / 2_000),
     ):
-        more = expected_of(small(tmp_path, num_envs=2, **due), 8)
+        more = expected_of(small(tmp_path, num_envs=2, **due))
         assert more.disk - whole.disk == pytest.approx(2 * weights * evaluations, abs=1)
 
 
@@ -182,10 +182,10 @@ def test_a_screen_that_stands_still_after_a_game_is_not_measured_and_what_is_the
 
     monkeypatch.setattr(trainer.emulators, "reset", counted)
     monkeypatch.setattr(forecast_module, "_median_seconds", many)
-    fresh = expected_of(trainer, 8, max_bytes=2**30, capacity=10**9)
+    fresh = expected_of(trainer, max_bytes=2**30, capacity=10**9)
     assert len(resets) == 200 // 40 + 2
     assert resets[0] == resets[-1] == [0, 1]
     trainer.run(lambda: trainer.counters.steps >= 100)
-    half = expected_of(trainer, 8, max_bytes=2**30, capacity=10**9)
+    half = expected_of(trainer, max_bytes=2**30, capacity=10**9)
     assert 2**29 < half.memory < fresh.memory
     assert half.disk < fresh.disk

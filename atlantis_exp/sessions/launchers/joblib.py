@@ -48,7 +48,7 @@ class _Running:
 
 
 def fitting(jobs: Sequence[Job], planned: int) -> Launcher:
-    """Return a launcher for as many jobs at a time as this machine runs well; the basic one for one job.
+    """Return a launcher for as many jobs at a time as this machine runs well; the basic one for one on all cores.
 
     planned: number of jobs in the whole sweep or look, including ended ones.
     """
@@ -56,7 +56,7 @@ def fitting(jobs: Sequence[Job], planned: int) -> Launcher:
     on_gpu = any(choose_device(config.device).type != "cpu" for config in configs)
     memory = psutil.virtual_memory()
     at_once, cores = fitted(configs, planned, all_cores(), here().cores, memory.total, memory.available, on_gpu)
-    return BASIC if at_once == 1 else Launcher("joblib", {"n_jobs": at_once, "cores": cores})
+    return BASIC if at_once == 1 and cores == here().cores else Launcher("joblib", {"n_jobs": at_once, "cores": cores})
 
 
 def fitted(
