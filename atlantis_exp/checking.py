@@ -128,7 +128,7 @@ def _explain(faults: list[ErrorDetails], tree: Mapping[str, Any]) -> str:
     key, kind = ".".join(path), fault["type"]
     if kind == "unexpected_keyword_argument":
         return f"{key}: no such key; {nearest(path[-1], set(siblings) - {path[-1]})}"
-    if kind == "missing":
+    if kind == "missing" or node == "???":
         return f"{key}: missing; it has no default"
     if kind == "union_tag_invalid":
         tags = str(fault["ctx"]["expected_tags"]).replace("'", "").split(", ")

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from io import TextIOWrapper
 from itertools import count
 from pathlib import Path
@@ -55,7 +55,7 @@ class _Console(Console):
 def guard() -> None:
     """Make stdout and stderr drop control characters and work in any encoding."""
     for name in ("stdout", "stderr"):
-        stream = getattr(sys, name)
+        stream = getattr(sys, name) or open(os.devnull, "w")  # noqa: SIM115, for good; a supervisor has closed it
         if not isinstance(stream, _Harmless):
             if isinstance(stream, TextIOWrapper):
                 stream.reconfigure(errors="backslashreplace")
@@ -142,15 +142,16 @@ def working(what: str, how_far: Callable[[], str] = str) -> Iterator[None]:
     def tell() -> None:
         if ended.wait(_FIRST_SECONDS):
             return
-        if not shown.is_terminal:
-            shown.print(line())
-            for lines in count():
-                if ended.wait(until_line(lines)):
-                    return
+        with suppress(OSError):  # of a full disk; the work goes on
+            if not shown.is_terminal:
                 shown.print(line())
-        with shown.status(line()) as status:
-            while not ended.wait(0.25):
-                status.update(line())
+                for lines in count():
+                    if ended.wait(until_line(lines)):
+                        return
+                    shown.print(line())
+            with shown.status(line()) as status:
+                while not ended.wait(0.25):
+                    status.update(line())
 
     thread = threading.Thread(target=tell, name="telling", daemon=True)
     thread.start()

@@ -31,9 +31,10 @@ class Bounded:
     [
         (0.0, "error=0.0: should be greater than or equal to 1e-06"),
         (0.5, "error=0.5: should be less than 0.5"),
+        ("???", "error: missing; it has no default"),
     ],
 )
-def test_a_bound_is_written_as_a_person_writes_it(value: float, line: str) -> None:
+def test_a_bound_is_written_as_a_person_writes_it(value: float | str, line: str) -> None:
     with pytest.raises(ConfigError) as refused:
         parse(Bounded, {"error": value})
     assert str(refused.value) == line

@@ -40,6 +40,29 @@ def test_whatever_is_printed_a_terminal_obeys_nothing_of_it(capsys: pytest.Captu
     assert "[31mred" in printed.out
 
 
+def test_closed_streams_are_written_to_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdout", None)
+    monkeypatch.setattr(sys, "stderr", None)
+    terminal.guard()
+    print("a line")
+    terminal.console().print("a line")
+    terminal.warn("a line")
+
+
+@pytest.mark.filterwarnings("error")
+def test_work_goes_on_where_its_progress_cannot_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = threading.Event()
+
+    def full(*_: object, **__: object) -> None:
+        tried.set()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(terminal, "_FIRST_SECONDS", 0.0)
+    monkeypatch.setattr(Console, "print", full)
+    with terminal.working("working"):
+        assert tried.wait(30)
+
+
 def test_a_table_has_its_names_on_the_left_and_its_numbers_on_the_right(capsys: pytest.CaptureFixture[str]) -> None:
     table = terminal.table("name", "number", title="both")
     table.add_row("a", "1")

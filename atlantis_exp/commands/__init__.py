@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from atlantis_exp import interrupts
+from atlantis_exp.faults import in_words
 
 VERBS = {
     "train": "train a network; the same command continues it or prints its result",
@@ -82,6 +83,10 @@ def _split(words: list[str]) -> tuple[str, list[str]]:
         text = f"atlantis-exp {version('atlantis-exp')}"
     else:
         return verb, arguments
-    with suppress(SystemExit):  # of a closed pipe
-        terminal.console().print(text)
+    try:
+        with suppress(SystemExit):  # of a closed pipe
+            terminal.console().print(text)
+    except OSError as error:
+        terminal.warn(in_words(error))
+        sys.exit(1)
     sys.exit(0)

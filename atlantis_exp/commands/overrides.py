@@ -8,6 +8,7 @@ import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
+from difflib import SequenceMatcher
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -95,11 +96,17 @@ def _override(key: str, value: object) -> str:
     return f"{key}={','.join(each if isinstance(each, str) else json.dumps(each) for each in values)}"
 
 
+_ITEM = re.compile(r"""(?:"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*'|[^,])+""")
+"""Of a list whose quoted items may hold commas."""
+
+
 def _located(match: re.Match[str]) -> str:
     """Return plugins as one list, however they were written."""
-    references, texts = [], match[1].removeprefix("[").removesuffix("]")
-    for text in texts.split(",") if texts else ():
-        reference = text.strip().strip("'\"")
+    references = []
+    for text in _ITEM.findall(match[1].removeprefix("[").removesuffix("]")):
+        reference = text.strip()
+        if re.fullmatch(r"(['\"]).*\1", reference, re.DOTALL):
+            reference = str(getattr(value := read_override(f"plugins={reference}").value(), "text", value))
         if "/" in reference or reference.endswith(".py"):
             reference = str(absolute("plugins", reference))
         references.append(quoted(reference))
@@ -397,5 +404,5 @@ def _nearest_key(key: str, keys: frozenset[str]) -> str:
     siblings = {known for known in keys if parent and known.rpartition(".")[0] == parent}
     exact = sorted(known for known in keys if known.rsplit(".", 1)[-1] == key.rsplit(".", 1)[-1])
     if exact and not siblings:
-        return f"did you mean '{exact[0]}'?"
+        return f"did you mean '{max(exact, key=lambda known: SequenceMatcher(None, key, known).ratio())}'?"
     return nearest(key, siblings or keys)

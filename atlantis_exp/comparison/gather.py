@@ -172,7 +172,7 @@ def read_runs(outputs: Path, runs: Sequence[str] = (), put_aside: bool = False) 
             if "~" in folder.name and not put_aside:
                 raise _Unusable(PUT_ASIDE)
             if not folder.has_started:
-                raise _Unusable(NOT_STARTED)
+                raise _Unusable(f"failed: {folder.error}" if folder.status == "FAILED" else NOT_STARTED)
             tree = folder.config
             if is_asked or "model" not in tree:
                 stored.runs.append(_open(folder, tree, later[folder.name]))
@@ -315,15 +315,16 @@ def is_of_another(evaluation: RunFolder, run: RunFolder) -> bool:
 
 
 def named_by(outputs: Path, runs: Iterable[str]) -> list[str]:
-    """Return `runs` with each decision's name replaced by the names of its runs.
+    """Return `runs` with each decision's name, start or pattern replaced by the names of its runs.
 
     Raises: Fault if a decision's folder is damaged.
     """
     folders = {path.name: RunFolder(path) for path in (outputs / "decisions").glob("decide-*")}
     patterns: list[str] = []
     for text in runs:
-        of = folders[text].config.get("runs") if text in folders else None
-        names = [run for run in of if isinstance(run, str)] if isinstance(of, list) else []
+        meant = [folder for name, folder in folders.items() if text.startswith("decide-") and fits(name, [text])]
+        found = [folder.config.get("runs") for folder in meant]
+        names = [run for of in found if isinstance(of, list) for run in of if isinstance(run, str)]
         patterns += names or [text]
     return patterns
 

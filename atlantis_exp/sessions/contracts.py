@@ -70,7 +70,12 @@ def check(contracts: Iterator[Contract], measured: Mapping[str, Job]) -> None:
     costs = list[documents.Cost]()
     if measured and not broken:
         for number, (name, job) in enumerate(measured.items(), 1):
-            costs.append(_cost(name, job, f"measuring costs, {number} of {len(measured)}"))
+            try:
+                costs.append(_cost(name, job, f"measuring costs, {number} of {len(measured)}"))
+            except Exception as error:
+                contract, because = f"learns from batches of {job.config.training.batch_size}", first_line(error)
+                tried.append(documents.Trial(component=name, contract=contract, kept=False, because=because))
+                broken.append(f"{name}: {contract} ({because})")
         terminal.console(least=120).print(_table(costs))
     terminal.document(documents.Check(trials=tried, costs=costs).model_dump_json())
     if broken:

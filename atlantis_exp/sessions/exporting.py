@@ -16,6 +16,7 @@ from atlantis_exp.runs.files import whole
 from atlantis_exp.runs.folder import RunFolder, find_run
 from atlantis_exp.runs.journal import Metrics, Tags
 from atlantis_exp.sessions.cards import Card, build_exported_actor, pack, portable, write_card
+from atlantis_exp.sessions.page import terminable
 from atlantis_exp.sessions.weights import stored_weights
 from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.training.progress import Progress
@@ -59,7 +60,7 @@ def export(
     settings = replace(evaluation, video=False, num_envs=evaluation.at_once)
     progress = Progress()
     try:
-        with whole(folder) as place:  # before playing: the folder may be refused
+        with terminable(), whole(folder) as place:  # before playing: the folder may be refused
             progress.say(f"{source.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
             played = build_evaluator(trained.env, settings, cores)(actor, settings.episodes, progress)
             card = Card(

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from atlantis_exp import terminal
 from atlantis_exp.documents import Report, Reported
+from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import EVALUATED, TABLE_COLUMNS, RunFolder, all_runs, fits
 from atlantis_exp.runs.journal import Metrics
 from atlantis_exp.tracking.publishing import catch_up, how_to_open
@@ -16,11 +17,16 @@ def report(outputs: Path, runs: Sequence[str] = (), where: Sequence[str] = ()) -
 
     Raises:
         ConfigError: if no run matches a text of `runs` or has a key of `where`.
-        Fault: if a run's folder is damaged.
+        Fault: if a run's folder is damaged, once the others are printed.
     """
     catch_up(outputs)
     folders = _chosen(outputs, runs, where)
-    reported = [_reported(run) for run in folders]
+    reported, damaged = list[Reported](), list[str]()
+    for run in folders:
+        try:
+            reported.append(_reported(run))
+        except Fault as fault:
+            damaged.append(f"left out {run.name}: {fault}")
     terminal.document(Report(runs=reported).model_dump_json())
     if not folders:
         print(f"no {'such ' if runs or where else ''}run under {outputs / 'runs'} yet")
@@ -35,6 +41,8 @@ def report(outputs: Path, runs: Sequence[str] = (), where: Sequence[str] = ()) -
     console = terminal.console(least=150)
     console.print(table)
     console.print(how_to_open(outputs), end="", soft_wrap=True)  # a command to copy
+    if damaged:
+        raise Fault("; ".join(damaged))
 
 
 def _reported(run: RunFolder) -> Reported:

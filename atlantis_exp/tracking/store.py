@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import sqlite3
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
@@ -212,7 +213,8 @@ def labels_of(commit: Commit) -> dict[str, str]:
 def first_line(error: Exception) -> str:
     """Return an error's first line."""
     text = str(error) if isinstance(error, Fault) else f"{type(error).__name__}: {error}"
-    return terminal.harmless(text.partition("\n")[0])
+    reason = re.search(r"\(sqlite3\.\w+\) .*", text)  # SQLAlchemy puts advice above it
+    return terminal.harmless(reason[0] if reason else text.partition("\n")[0])
 
 
 def all_pages(search: "Callable[..., PagedList[P]]") -> list[P]:

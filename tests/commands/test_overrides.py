@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from hydra import compose
@@ -68,6 +68,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("optimizer.lr=???", "optimizer.lr", "issing"),
     ("samplers.uniform.name=top_half", "samplers.uniform.oversample", "missing"),
     ("=1", "=1", "no such key"),
+    ("experiment=quick phase.quikc.steps=1", "phase.quikc.steps=1", "'phase.quick.steps'"),
     # options
     ("model=resnt", "model=resnt", "'resnet'"),
     ("experiment=quik", "experiment=quik", "'quick'"),
@@ -312,6 +313,14 @@ def test_what_is_right_passes(line: str) -> None:
 def test_a_printed_command_holds_the_value(text: str) -> None:
     value = read_override(f"key={quoted(text)}").value()
     assert str(value.text if isinstance(value, QuotedString) else value) == text
+
+
+@pytest.mark.parametrize("typed", ["'./a,b/x.py'", '"./a,b/x.py"', "['./a,b/x.py']", '["./a,b/x.py",other]'])
+def test_the_path_of_a_plugin_may_hold_a_comma(typed: str) -> None:
+    (text,) = located([f"plugins={typed}"])
+    first, *others = cast(list[str], read_override(text).value())
+    assert first == str(Path.cwd() / "a,b" / "x.py")
+    assert others == (["other"] if "other" in typed else [])
 
 
 def test_a_sweep_kept_in_a_file_is_the_one_typed_out(tmp_path: Path) -> None:

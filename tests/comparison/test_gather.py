@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from atlantis_exp.comparison.choosing import group, plays_alike, refuse_mixed_protocols, select
-from atlantis_exp.comparison.gather import Player, gather
+from atlantis_exp.comparison.gather import Player, gather, named_by
 from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError
@@ -67,6 +67,11 @@ def test_only_what_is_committed_counts(recorded: Recorded, tmp_path: Path) -> No
     assert run.curve["frames"].tolist() == [0, 600]
 
 
+def fail_before_it_starts(run: Path) -> None:
+    (run / "config.json").unlink()
+    Journal(run).status("FAILED", "of its network")
+
+
 def test_broken_unfinished_foreign_and_put_aside_runs_are_named_and_do_not_count(
     recorded: Recorded, tmp_path: Path
 ) -> None:
@@ -79,6 +84,7 @@ def test_broken_unfinished_foreign_and_put_aside_runs_are_named_and_do_not_count
         "broken: ": lambda run: (run / "config.json").write_text('{"mod'),
         "foreign: its config.json is not one of ours": lambda run: (run / "config.json").write_text('{"lr": 1}'),
         "foreign: it has no config.json": lambda run: (run / "config.json").unlink(),
+        "failed: of its network": fail_before_it_starts,
         "no evaluation after its last step: evaluate run=": lambda run: shutil.rmtree(run / "artifacts"),
         "broken: .*it has none": lambda run: next(run.rglob("*.csv")).write_text("score,steps\n"),
         "broken: .*result.json is damaged": lambda run: (run / "result.json").write_text("[1]"),
@@ -136,6 +142,15 @@ def test_an_evaluation_of_a_run_that_was_put_aside_is_not_the_new_ones(recorded:
     assert gather(tmp_path).trainings[0].episodes.scores.tolist() == [1_000]
     evaluated(tmp_path, new, 1_150.0, 0.05)
     assert gather(tmp_path).trainings[0].episodes.scores.tolist() == [1_150]
+
+
+def test_a_decision_is_named_by_its_start(tmp_path: Path) -> None:
+    for name in ("decide-311d", "decide-4"):
+        (tmp_path / "decisions" / name).mkdir(parents=True)
+        (tmp_path / "decisions" / name / "config.json").write_text(f'{{"runs": ["of-{name}"]}}')
+    assert named_by(tmp_path, ["decide-3", "cnn"]) == ["of-decide-311d", "cnn"]
+    assert named_by(tmp_path, ["decide-", "*"]) == ["of-decide-311d", "of-decide-4", "*"]
+    assert named_by(tmp_path, ["decide-5"]) == ["decide-5"]
 
 
 @pytest.mark.parametrize("runs", ["5", "null", "[1, {}]"])

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from atlantis_exp import terminal
+from atlantis_exp import documents, terminal
 from atlantis_exp.commands import CHECKOUT
 from atlantis_exp.commands.app import Asked
 from atlantis_exp.commands.check import CheckConfig, _work
@@ -17,6 +17,7 @@ from atlantis_exp.commands.overrides import check
 from atlantis_exp.components import KINDS, admit
 from atlantis_exp.config import Config
 from atlantis_exp.faults import Fault
+from atlantis_exp.sessions import contracts as contracts_module
 from atlantis_exp.sessions.contracts import _train, contracts_of
 from atlantis_exp.sessions.contracts import check as check_contracts
 from atlantis_exp.sessions.job import Job, replaced
@@ -151,6 +152,23 @@ def test_what_is_broken_is_said_before_anything_is_measured() -> None:
     not_measured: Any = {"model=mine": None}
     with pytest.raises(Fault, match=r"^broken: model=mine: learns$"):
         check_contracts(iter([("model=mine", "learns", partial(int, "x"))]), not_measured)
+
+
+def test_a_training_that_fails_while_it_is_measured_is_broken_and_the_others_are_shown(
+    monkeypatch: pytest.MonkeyPatch, tiny: Compose, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def cost(name: str, *_: object) -> documents.Cost:
+        if name == "model=late":
+            raise ZeroDivisionError("of 16")
+        numbers = dict.fromkeys(("pixels", "parameters"), 7)
+        rates = dict.fromkeys(("flops_per_sample", "updates_per_second", "steps_per_second"), 7.0)
+        return documents.Cost(component=name, **numbers, **rates)
+
+    monkeypatch.setattr(contracts_module, "_cost", cost)
+    job = Job(tiny("training.batch_size=16"))
+    with pytest.raises(Fault, match=r"^broken: model=late: learns from batches of 16 \(ZeroDivisionError: of 16\)$"):
+        check_contracts(iter(()), {"model=late": job, "model=cnn": job})
+    assert "model=cnn" in capsys.readouterr().out
 
 
 def test_how_many_contracts_are_left_is_said_while_one_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:

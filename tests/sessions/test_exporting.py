@@ -4,6 +4,7 @@ import json
 import re
 import resource
 import shutil
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -235,6 +236,18 @@ def test_an_export_to_a_full_disk_is_one_line_and_leaves_nothing(
     assert {path.name for path in tmp_path.iterdir()} == {"runs"}
     assert command(*words) == 0
     assert read_card(tmp_path / "new")[0].run
+
+
+def test_an_export_that_is_terminated_leaves_nothing(
+    command: Command, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def end(*_: object) -> None:
+        assert (tmp_path / "new.aside").is_dir()
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(exporting, "build_evaluator", end)
+    assert command("export", f"to={tmp_path}/new", f"paths.outputs={trained}", "device=cpu") == 143
+    assert not [*tmp_path.glob("new*")]
 
 
 @pytest.mark.parametrize(

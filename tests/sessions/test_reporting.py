@@ -41,8 +41,10 @@ def test_a_run_that_has_not_ended_has_its_last_evaluation(tmp_path: Path, capsys
     assert two.replace("│", "").split() == ["two", "1,000", "(interrupted)", *["1,000"] * 6, "100025.0%", "1000"]
 
     (run.path / "journal.jsonl").write_bytes((run.path / "journal.jsonl").read_bytes().replace(b"{", b"[", 1))
-    with pytest.raises(Fault, match=r"^run two: .*byte 0"):
+    with pytest.raises(Fault, match=r"^left out two: run two: .*byte 0"):
         report(tmp_path)
+    (shown,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("│"))
+    assert shown.replace("│", "").split() == ["none", "interrupted"]
 
 
 def test_a_run_that_is_made_longer_has_its_last_evaluation(

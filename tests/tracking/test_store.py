@@ -19,7 +19,7 @@ from atlantis_exp.sessions.syncing import publish_all
 from atlantis_exp.tracking.mirror import publish
 from atlantis_exp.tracking.publishing import Publisher
 from atlantis_exp.tracking.server import PatientClient, TooSlow
-from atlantis_exp.tracking.store import Store
+from atlantis_exp.tracking.store import Store, first_line
 from tests.tracking.folders import a_full_journal, commit, rows
 
 REPOSITORY = Path(__file__).parents[2]
@@ -145,6 +145,14 @@ def test_a_database_that_cannot_be_used_is_one_line_with_the_remedy_for_every_co
     (tmp_path / "mlflow.db").unlink()
     mlflow_tables(tmp_path)
     assert publisher.drain(120)
+
+
+def test_the_databases_reason_is_named_and_not_the_advice_above_it() -> None:
+    error = MlflowException(
+        "(raised as a result of autoflush;\n see below)\n(sqlite3.OperationalError) database is locked\n"
+    )
+    assert first_line(error) == "(sqlite3.OperationalError) database is locked"
+    assert first_line(ValueError("one\ntwo")) == "ValueError: one"
 
 
 @pytest.mark.parametrize("pieces", [0, 1])
