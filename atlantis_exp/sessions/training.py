@@ -74,6 +74,9 @@ def train(job: Job, watch: Callable[[Trainer], bool] = lambda _: False) -> int |
                     at = f"{trainer.counters.steps:,}"
                     progress.say(f"SIGTERM: committed at step {at}, going on until Slurm ends it")
                     outcome = trainer.run(lambda: stop() or watched())
+        if not folder.has_started:
+            moved = f"{folder.path} was moved or deleted meanwhile"
+            raise Fault(f"run {folder.name}: {moved}; finish it with: {job.command}")
         result = _close(trainer, folder, journal, outcome)
     steps = f"{trainer.counters.steps:,}"
     if outcome != "interrupted":

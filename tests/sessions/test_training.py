@@ -157,6 +157,24 @@ def test_a_longer_plan_says_which_run_is_the_same_over_a_shorter_one_and_why_it_
     assert _kin(Job(tiny("seed=1")), RunFolder.of(tiny("seed=1"))) == ""
 
 
+def test_a_folder_that_is_moved_meanwhile_is_said_to_be_and_the_same_command_finishes_the_run(
+    tiny: Compose, tmp_path: Path
+) -> None:
+    job = Job(tiny(*SHORT))
+    folder = RunFolder.of(job.config)
+
+    def move(trainer: Trainer) -> bool:
+        if trainer.counters.steps >= 20 and not (tmp_path / "moved").exists():
+            folder.path.rename(tmp_path / "moved")
+        return False
+
+    with pytest.raises(Fault, match=rf"^run {folder.name}: .* was moved or deleted meanwhile; finish it with: "):
+        train(job, move)
+    assert folder.result is None
+    train(job)
+    assert folder.result is not None
+
+
 def test_a_run_that_was_put_aside_has_no_other_plan(tiny: Compose, recorded: Callable[..., Path]) -> None:
     folder = RunFolder(recorded())
     folder.put_aside()
