@@ -47,6 +47,11 @@ def main() -> None:
     try:
         verb, arguments = _split(sys.argv[1:])
         importlib.import_module(f"atlantis_exp.commands.{verb}").VERB.run(arguments)
+    except OSError as error:
+        from atlantis_exp import terminal
+
+        terminal.warn(in_words(error))
+        sys.exit(1)
     except (Exception, KeyboardInterrupt) as error:
         if isinstance(error, Exception) and not interrupts.seen():
             raise
@@ -83,10 +88,6 @@ def _split(words: list[str]) -> tuple[str, list[str]]:
         text = f"atlantis-exp {version('atlantis-exp')}"
     else:
         return verb, arguments
-    try:
-        with suppress(SystemExit):  # of a closed pipe
-            terminal.console().print(text)
-    except OSError as error:
-        terminal.warn(in_words(error))
-        sys.exit(1)
+    with suppress(SystemExit):  # of a closed pipe
+        terminal.console().print(text)
     sys.exit(0)

@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 from atlantis_exp import interrupts, terminal
 from atlantis_exp.commands.composing import admit_plugins
 from atlantis_exp.commands.overrides import check, flags_of, launcher, located, refuse_twice, shown
-from atlantis_exp.faults import ConfigError, Fault, in_words
+from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.machine import Machine, here
 from atlantis_exp.sessions.launchers import Launcher, in_turn
 from atlantis_exp.terminal import command_line
@@ -76,9 +76,6 @@ class Verb(Generic[T]):
         except Fault as error:
             terminal.warn(str(error))
             sys.exit(error.exit_code)
-        except OSError as error:
-            terminal.warn(in_words(error))
-            sys.exit(1)
 
     def read(self, words: Sequence[str]) -> tuple[list[str], list[Asked[T]]]:
         """Return typed words as Hydra's overrides, and the checked jobs that they ask for. Raises: ConfigError."""

@@ -106,7 +106,7 @@ def _located(match: re.Match[str]) -> str:
     for text in _ITEM.findall(match[1].removeprefix("[").removesuffix("]")):
         reference = text.strip()
         if re.fullmatch(r"(['\"]).*\1", reference, re.DOTALL):
-            reference = str(getattr(value := read_override(f"plugins={reference}").value(), "text", value))
+            reference = str(read_override(f"plugins={reference}").value())
         if "/" in reference or reference.endswith(".py"):
             reference = str(absolute("plugins", reference))
         references.append(quoted(reference))

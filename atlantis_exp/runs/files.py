@@ -16,6 +16,8 @@ from typing import Annotated, Any, BinaryIO, TypeVar
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic_core import from_json
 
+from atlantis_exp.faults import Fault
+
 T = TypeVar("T")
 
 Natural = Annotated[int, Field(ge=0, lt=2**63)]
@@ -127,14 +129,16 @@ def write_file(path: Path, content: bytes) -> None:
 
 @contextmanager
 def whole(folder: Path) -> Iterator[Path]:
-    """Yield a folder to fill, which becomes `folder` if the block succeeds. Raises: OSError."""
+    """Yield a folder to fill, which becomes the folder of `to=` if the block succeeds. Raises: Fault for an OSError."""
     aside = folder.with_name(folder.name + ".aside")
     shutil.rmtree(aside, ignore_errors=True)
-    make_folder(aside)
     try:
+        make_folder(aside)
         yield aside
         aside.replace(folder)
         _sync(folder.parent)
+    except OSError as error:
+        raise Fault(f"to={folder}: {error}; nothing is written; make room there, or name another folder") from error
     finally:
         shutil.rmtree(aside, ignore_errors=True)
 

@@ -264,18 +264,18 @@ def say_what_it_takes(contest: Contest) -> None:
     """Print the number of runs, the hours that they take here, and the difference that they can find."""
     say = terminal.console().print
     looks, count = contest.looks, len(contest.contenders)
-    missing = {label: len(contest.left(label, range(looks[-1]))) for label in contest.contenders}
+    missing = {label: contest.left(label, range(looks[-1])) for label in contest.contenders}
     fewest = f"{count * looks[0]} to " if len(looks) > 1 else ""
     say(
         f"{', '.join(contest.contenders)}: {fewest}{count * looks[-1]} runs, looks at "
-        f"{' and '.join(map(str, looks))} seeds each; {count * looks[-1] - sum(missing.values())} exist."
+        f"{' and '.join(map(str, looks))} seeds each; {count * looks[-1] - sum(map(len, missing.values()))} exist."
     )
     launcher, forecasts = BASIC if contest.launcher else contest.here, dict[str, float]()
     cores = launcher.settings.get("cores")
     if not contest.launcher:
         say(how_many(launcher))
-    for label, runs in missing.items():
-        if runs and contest.config.budget.forecast != "off":
+    for label, seeds in missing.items():
+        if seeds and contest.config.budget.forecast != "off":
             forecasts[label] = measure(contest.job(label, 0), cores)[1].hours
             where = "on its share" if cores else "alone on this machine"
             say(f"{label}: {duration(forecasts[label])} a run, {where}")
@@ -284,7 +284,7 @@ def say_what_it_takes(contest: Contest) -> None:
         for span in pairwise((0, *looks)):
             ends = [hours] * at_once  # of the trainings side by side; a look waits for the last
             for seed, label in product(range(*span), forecasts):
-                if contest.left(label, [seed]):
+                if seed in missing[label]:
                     heapreplace(ends, ends[0] + forecasts[label])
             hours = max(ends)
         how = "side by side" if at_once > 1 else "one after the other"

@@ -11,7 +11,7 @@ from atlantis_exp import terminal
 from atlantis_exp.build import build_evaluator
 from atlantis_exp.checking import absolute, check_new
 from atlantis_exp.config import EvaluationConfig, PathsConfig
-from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.files import whole
 from atlantis_exp.runs.folder import RunFolder, find_run
 from atlantis_exp.runs.journal import Metrics, Tags
@@ -59,26 +59,23 @@ def export(
             exported = export_onnx(trained, packed)
     settings = replace(evaluation, video=False, num_envs=evaluation.at_once)
     progress = Progress()
-    try:
-        with terminable(), whole(folder) as place:  # before playing: the folder may be refused
-            progress.say(f"{source.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
-            played = build_evaluator(trained.env, settings, cores)(actor, settings.episodes, progress)
-            card = Card(
-                format=1,
-                run=source.name,
-                weights=weights,
-                step=step,
-                reached=reached,
-                made=made,
-                precision=precision,
-                sha256=hashlib.sha256(packed).hexdigest(),
-                config=trained,
-                evaluation=settings,
-                scores=[episode.score for episode in played.episodes],
-            )
-            write_card(place, typed, card, packed, played, exported and exported.content)
-    except OSError as error:
-        raise Fault(f"to={folder}: {error}; nothing is written; make room there, or name another folder") from error
+    with terminable(), whole(folder) as place:  # before playing: the folder may be refused
+        progress.say(f"{source.name} at step {step:,}: {settings.episodes} episodes, epsilon {settings.epsilon}")
+        played = build_evaluator(trained.env, settings, cores)(actor, settings.episodes, progress)
+        card = Card(
+            format=1,
+            run=source.name,
+            weights=weights,
+            step=step,
+            reached=reached,
+            made=made,
+            precision=precision,
+            sha256=hashlib.sha256(packed).hexdigest(),
+            config=trained,
+            evaluation=settings,
+            scores=[episode.score for episode in played.episodes],
+        )
+        write_card(place, typed, card, packed, played, exported and exported.content)
     print(f"\n{played.report()}\n\n{len(packed):,} bytes in {precision}, with card and scores, in {folder}")
     if exported:
         print(f"network.onnx: within {exported.difference:.1g} of torch's values in {exported.states} states")

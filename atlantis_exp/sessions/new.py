@@ -5,7 +5,6 @@ from pathlib import Path
 
 from atlantis_exp.checking import check_new
 from atlantis_exp.components import ENTRY_POINTS
-from atlantis_exp.faults import Fault
 from atlantis_exp.runs.files import whole, write_file
 from atlantis_exp.terminal import command_line, quoted
 
@@ -56,7 +55,7 @@ def test_it_keeps_every_contract() -> None:
 
 
 def begin(kind: str, name: str, folder: Path, examples: Path) -> None:
-    """Write a package with a working component, whole or not at all. Raises: ConfigError."""
+    """Write a package with a working component, whole or not at all. Raises: ConfigError, Fault."""
     check_new(folder)
     example, suffix = EXAMPLES[kind]
     source = (examples / f"{example}.py").read_text()
@@ -77,12 +76,9 @@ def begin(kind: str, name: str, folder: Path, examples: Path) -> None:
         package / "__init__.py": f'"""A component of atlantis_exp: {kind}={name}."""\n',
         package / f"{name}.py": re.sub(rf"\b{example.title()}{suffix}\b", own + suffix, source),
     }
-    try:
-        with whole(folder) as aside:
-            for path, text in files.items():
-                write_file(aside / path, text.encode())
-    except OSError as error:
-        raise Fault(f"to={folder}: {error}; make room there, or name another folder") from error
+    with whole(folder) as aside:
+        for path, text in files.items():
+            write_file(aside / path, text.encode())
     print(*(folder / path for path in files), sep="\n")
     plugin = quoted(f"{folder / package / name}.py")
     print("\n" + command_line("check", f"{kind}={name}", f"plugins={plugin}"))
