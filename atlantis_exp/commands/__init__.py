@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from atlantis_exp import interrupts
-from atlantis_exp.faults import in_words
+from atlantis_exp.faults import ConfigError, Fault, in_words
 
 VERBS = {
     "train": "train a network; the same command continues it or prints its result",
@@ -42,16 +42,20 @@ def default_outputs() -> Path:
 
 
 def main() -> None:
-    """Run the verb that the command line names first; only its own module is imported."""
+    """Run the verb that the command line names first; only its own module is imported.
+
+    A `Fault` or an OSError ends the process with one line and its exit code, which is 2 for a user's mistake.
+    """
     interrupts.listen()
     try:
         verb, arguments = _split(sys.argv[1:])
         importlib.import_module(f"atlantis_exp.commands.{verb}").VERB.run(arguments)
-    except OSError as error:
+    except (Fault, OSError) as error:
         from atlantis_exp import terminal
 
-        terminal.warn(in_words(error))
-        sys.exit(1)
+        known = error if isinstance(error, Fault) else Fault(in_words(error))
+        terminal.warn(str(known))
+        sys.exit(known.exit_code)
     except (Exception, KeyboardInterrupt) as error:
         if isinstance(error, Exception) and not interrupts.seen():
             raise
@@ -60,7 +64,10 @@ def main() -> None:
 
 
 def _split(words: list[str]) -> tuple[str, list[str]]:
-    """Return a command line's verb and its arguments; or print help, completions or the version, and exit."""
+    """Return a command line's verb and its arguments; or print help, completions or the version, and exit.
+
+    Raises: ConfigError.
+    """
     from atlantis_exp import terminal
 
     terminal.guard()
@@ -70,8 +77,7 @@ def _split(words: list[str]) -> tuple[str, list[str]]:
     elif first and "=" not in first and first[0] not in "-~+":
         from atlantis_exp.checking import nearest
 
-        terminal.warn(f"{first}: no such verb; {nearest(first, VERBS)}")
-        sys.exit(2)
+        raise ConfigError(f"{first}: no such verb; {nearest(first, VERBS)}")
     else:
         verb, arguments = "train", words
     if first in ("--complete", "--completion"):

@@ -1,6 +1,5 @@
 """Run a verb: check its arguments before anything is written, then make the one call that does the work."""
 
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
@@ -9,7 +8,7 @@ from typing import Generic, TypeVar
 from atlantis_exp import interrupts, terminal
 from atlantis_exp.commands.composing import admit_plugins
 from atlantis_exp.commands.overrides import check, flags_of, launcher, located, refuse_twice, shown
-from atlantis_exp.faults import ConfigError, Fault
+from atlantis_exp.faults import ConfigError
 from atlantis_exp.machine import Machine, here
 from atlantis_exp.sessions.launchers import Launcher, in_turn
 from atlantis_exp.terminal import command_line
@@ -49,33 +48,26 @@ class Verb(Generic[T]):
     """Does a sweep's jobs with a launcher, given the arguments; None: one after the other."""
 
     def run(self, arguments: list[str]) -> None:
-        """Check the config that the arguments make, and do the work.
-
-        A `Fault` or an OSError ends the process with one line and its exit code, which is 2 for a user's mistake.
-        """
-        try:
-            arguments, asked = self.read(arguments)
-            flags = flags_of(arguments)
-            if flags.multirun:
+        """Check the config that the arguments make, and do the work. Raises: ConfigError, Fault, OSError."""
+        arguments, asked = self.read(arguments)
+        flags = flags_of(arguments)
+        if flags.multirun:
+            interrupts.hold()
+        is_text = flags.cfg or getattr(asked[0].config, "format", "text") == "text"
+        with nullcontext() if is_text else terminal.only_documents():
+            if flags.cfg:
+                print(shown(self.config_name or self.name, arguments), end="")
+            elif not flags.multirun:
+                with terminal.working(f"{self.name}: loading"):
+                    call = self.work(asked[0])
                 interrupts.hold()
-            is_text = flags.cfg or getattr(asked[0].config, "format", "text") == "text"
-            with nullcontext() if is_text else terminal.only_documents():
-                if flags.cfg:
-                    print(shown(self.config_name or self.name, arguments), end="")
-                elif not flags.multirun:
-                    with terminal.working(f"{self.name}: loading"):
-                        call = self.work(asked[0])
-                    interrupts.hold()
-                    call()
-                elif self.sweep is not None:
-                    self.sweep(asked, launcher(arguments), arguments)
-                elif not launcher(arguments).is_basic:
-                    raise ConfigError(f"hydra/launcher: only trainings can be launched, not {self.name}; drop it")
-                else:
-                    in_turn(lambda each: self.work(each)(), asked, terminal.warn)
-        except Fault as error:
-            terminal.warn(str(error))
-            sys.exit(error.exit_code)
+                call()
+            elif self.sweep is not None:
+                self.sweep(asked, launcher(arguments), arguments)
+            elif not launcher(arguments).is_basic:
+                raise ConfigError(f"hydra/launcher: only trainings can be launched, not {self.name}; drop it")
+            else:
+                in_turn(lambda each: self.work(each)(), asked, terminal.warn)
 
     def read(self, words: Sequence[str]) -> tuple[list[str], list[Asked[T]]]:
         """Return typed words as Hydra's overrides, and the checked jobs that they ask for. Raises: ConfigError."""

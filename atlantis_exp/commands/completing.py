@@ -4,8 +4,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from atlantis_exp.checking import nearest
 from atlantis_exp.commands import VERBS, default_outputs
 from atlantis_exp.commands.helping import key_names, options_of
+from atlantis_exp.faults import ConfigError
 
 SCRIPTS = {
     "bash": """\
@@ -33,10 +35,12 @@ compdef _atlantis_exp atlantis-exp""",
 
 
 def complete(flag: str, words: Sequence[str]) -> str:
-    """Return the completions for `--complete WORDS`, or the script for `--completion SHELL`."""
+    """Return the completions for `--complete WORDS`, or the script for `--completion SHELL`. Raises: ConfigError."""
     if flag == "--complete":
         return "\n".join(candidates(words))
-    return SCRIPTS.get("".join(words), f"echo 'atlantis_exp: --completion: one of {', '.join(SCRIPTS)}' >&2")
+    if (shell := "".join(words)) not in SCRIPTS:
+        raise ConfigError(f"--completion: {shell}: no such shell; {nearest(shell, SCRIPTS)}")
+    return SCRIPTS[shell]
 
 
 def candidates(words: Sequence[str]) -> list[str]:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -52,7 +53,7 @@ class Card:
 def read_card(folder: Path) -> tuple[Card, bytes]:
     """Read a folder's card and its weights as safetensors. Raises: ConfigError, Fault for other weights."""
     path = folder / "card.json"  # may be a link, as in a download cache: a person named this folder
-    if not path.exists():
+    if not os.path.exists(path):
         choices = {"latest", "best", *(str(card.parent) for card in folder.parent.glob("*/card.json"))}
         has = "" if folder.parent.exists() else "; the shipped weights are in pretrained/ of the repository"
         raise ConfigError(f"weights={folder}: not a folder with a card.json{has}; {nearest(str(folder), choices)}")
@@ -83,16 +84,16 @@ def write_card(
             f"{env.size}), to `q_values`, float32 (batch, actions)."
         )
     place = shown if len(shown.parts) > 1 and not shown.is_absolute() else f"./{shown.name}"
-    play, references = f"python -m atlantis_exp evaluate weights={place}", list[str]()
+    references = list[str]()
     hashes = {plugin.sha256 for plugin in card.config.plugins.values()}
     for plugin in dict.fromkeys(each.plugin for each in admitted().values()):
         if plugin and plugin.sha256 in hashes:
-            references.append(plugin.name if plugin.text is None else f"{place}/{plugin.name}.py")
+            references.append(plugin.name if plugin.text is None else terminal.quoted(f"{place}/{plugin.name}.py"))
             if plugin.text is not None:
                 write_file(folder / f"{plugin.name}.py", plugin.text)
                 files += f"\n\n`{plugin.name}.py`: the source of a plugin, sha256 `{plugin.sha256}`."
-    if references:
-        play += f" plugins={','.join(references)}"
+    plugins = [f"plugins={','.join(references)}"] if references else []
+    play = terminal.command_line("evaluate", f"weights={terminal.quoted(place)}", *plugins)
     write_file(folder / "README.md", _page(shown.name, play, card, files, evaluation).encode())
     write_file(folder / "card.json", (json.dumps(to_dict(card), indent=2) + "\n").encode())
 

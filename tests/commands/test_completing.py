@@ -63,5 +63,7 @@ def test_each_shell_gets_its_script_and_another_one_a_line(
     for shell, script in SCRIPTS.items():
         assert command("--completion", shell) == 0
         assert capsys.readouterr().out == f"{script}\n"
-    assert command("--completion", "csh") == 0
-    assert "one of bash, zsh, fish" in capsys.readouterr().out  # which the shell then says
+    assert command("--completion", "fsh") == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "--completion: fsh: no such shell; did you mean 'fish'?" in printed.err

@@ -1,11 +1,12 @@
 """What a search may draw its values from, and what is said of a command line that asks for no search."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from atlantis_exp.commands.search import CLOSED, VERB
+from atlantis_exp.commands.search import CLOSED
 from atlantis_exp.faults import ConfigError
 
 pytest.importorskip("optuna", reason="needs pip install 'atlantis-exp[search]'")
@@ -91,26 +92,21 @@ def test_an_impossible_space_is_refused_in_one_line_before_anything_starts(
     ],
 )
 def test_a_mistake_ends_the_command_with_code_2(
-    line: str, hint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    line: str, hint: str, command: Callable[..., int], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["atlantis_exp"])
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    with pytest.raises(SystemExit) as caught:
-        VERB.run([*line.split(), f"paths.outputs={tmp_path}"])
-    assert caught.value.code == 2
+    assert command("search", *line.split(), f"paths.outputs={tmp_path}") == 2
     assert hint in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
 def test_without_optuna_the_extra_is_named(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    command: Callable[..., int],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["atlantis_exp"])
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     monkeypatch.delitem(sys.modules, "atlantis_exp.sessions.search", raising=False)
     monkeypatch.setitem(sys.modules, "optuna", None)
-    with pytest.raises(SystemExit) as caught:
-        VERB.run(["optimizer=adam,rmsprop", f"paths.outputs={tmp_path}"])
-    assert caught.value.code == 2
+    assert command("search", "optimizer=adam,rmsprop", f"paths.outputs={tmp_path}") == 2
     assert capsys.readouterr().err == "atlantis_exp: search needs Optuna: pip install 'atlantis-exp[search]'\n"
     assert list(tmp_path.iterdir()) == []

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from atlantis_exp.commands.compare import VERB
 from atlantis_exp.comparison.account import Account
 from atlantis_exp.comparison.choosing import PROTOCOL, group
 from atlantis_exp.comparison.decision import Look, mean_interval
@@ -127,16 +126,11 @@ def _undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Runs the verb and returns what it prints, on one line; `code` is the exit code that it must end with."""
+def run(command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Return a function that compares, checks its exit code and returns the printed text on one line."""
 
     def compared(*words: str, code: int = 0) -> str:
-        arguments = [f"paths.outputs={tmp_path}", "tracking=none", *words]
-        if code:
-            with pytest.raises(SystemExit, match=f"^{code}$"):
-                VERB.run(arguments)
-        else:
-            VERB.run(arguments)
+        assert command("compare", f"paths.outputs={tmp_path}", "tracking=none", *words) == code
         shown = capsys.readouterr()
         return " ".join((shown.err if code else shown.out).split())
 

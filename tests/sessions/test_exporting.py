@@ -3,6 +3,7 @@
 import json
 import re
 import resource
+import shlex
 import shutil
 import signal
 from collections.abc import Callable
@@ -27,6 +28,7 @@ from atlantis_exp.sessions import cards, exporting, onnx
 from atlantis_exp.sessions.cards import build_exported_actor, read_card
 from atlantis_exp.sessions.job import Job, replaced
 from atlantis_exp.sessions.training import train
+from atlantis_exp.terminal import quoted
 from atlantis_exp.training.actor import EpsilonGreedy
 from atlantis_exp.training.trainer import Trainer
 
@@ -155,9 +157,10 @@ def test_exported_weights_score_what_their_card_says(
 ) -> None:
     """In half precision, which is what this limit takes."""
     monkeypatch.setattr(cards, "SINGLE", 300_000)
-    folder = tmp_path / "pretrained" / "tiny"
+    folder = tmp_path / "pretrained" / "it's, tiny"
     outputs = (f"paths.outputs={trained}", "device=cpu")
-    assert command("export", f"to={folder}", "episodes=3", "epsilon=0.9", "evaluation.num_envs=1", *outputs) == 0
+    made = (f"to={quoted(folder)}", "episodes=3", "epsilon=0.9", "evaluation.num_envs=1")
+    assert command("export", *made, *outputs) == 0
 
     card, weights = read_card(folder)
     assert card.precision == "float16"
@@ -180,7 +183,9 @@ def test_exported_weights_score_what_their_card_says(
     assert not any(str(trained) in path.read_text() for path in (folder / "README.md", folder / "card.json"))
 
     capsys.readouterr()
-    played = (f"weights={folder}", *outputs, "tracking=none")
+    monkeypatch.chdir(folder.parent)
+    (line,) = re.findall(r"^ +(.* atlantis_exp evaluate .*)  # plays the episodes below$", page, re.MULTILINE)
+    played = (*shlex.split(line)[4:], *outputs, "tracking=none")
     assert command("evaluate", *played) == 0
     table = [[cell.strip() for cell in line.split("│")] for line in capsys.readouterr().out.splitlines()]
     rows = {row[1]: row[2:-1] for row in table if len(row) > 3}
@@ -198,9 +203,9 @@ def test_exported_weights_score_what_their_card_says(
     (training,) = gathered.trainings
     alike = {player.config["evaluation.epsilon"]: plays_alike(player, [training]) for player in gathered.players}
     assert alike == {0.9: False, 0.05: True}
-    assert {player.called for player in gathered.players} == {"weights tiny"}
+    assert {player.called for player in gathered.players} == {"weights it's, tiny"}
     comparison = compare(gathered, group(gathered.trainings, ["model"]), Question(["model"]))
-    assert re.search(r"In the same game, on average: weights tiny [\d,]+\.", " ".join(comparison.notes))
+    assert re.search(r"In the same game, on average: weights it's, tiny [\d,]+\.", " ".join(comparison.notes))
 
 
 def test_an_export_neither_overwrites_nor_starts_without_weights(
