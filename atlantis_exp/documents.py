@@ -1,17 +1,14 @@
 """The JSON documents that verbs print with `format=json`; docs/json.md has their schema.
 
+They write NaN, which stands for a number that does not exist, as null.
+
 A new field keeps the version; removing a field or changing its meaning increments it.
 """
 
-from math import isfinite
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, Field, TypeAdapter
+from pydantic import BaseModel, Field
 
-Number = Annotated[
-    float | None, BeforeValidator(lambda value: value if isinstance(value, int) or isfinite(value or 0) else None)
-]
-"""A number; null if there is none."""
 Said = Literal["better", "worse", "equivalent", "not decided"]
 
 
@@ -40,9 +37,9 @@ class GroupScore(BaseModel):
 
     family: str = Field(description="the key, or all keys that differ")
     group: str
-    score: Number
-    low: Number = Field(description="95 % interval; null for fewer than five seeds")
-    high: Number
+    score: float | None
+    low: float | None = Field(description="95 % interval; null for fewer than five seeds")
+    high: float | None
     seeds: dict[int, float] = Field(description="score by seed")
 
 
@@ -53,9 +50,9 @@ class PairVerdict(BaseModel):
     group: str
     other: str
     said: Said = Field(description="verdict on the group, against the other")
-    difference: Number
-    low: Number = Field(description="the interval that the verdict rests on")
-    high: Number
+    difference: float | None
+    low: float | None = Field(description="the interval that the verdict rests on")
+    high: float | None
     seeds: int = Field(description="per group at that look; 0 before the first")
 
 
@@ -136,9 +133,3 @@ class Check(Document):
     verb: Literal["check"] = "check"
     trials: list[Trial]
     costs: list[Cost] = Field(description="empty if a contract is broken")
-
-
-AnyDocument: TypeAdapter[Compared | Report | Query | Check] = TypeAdapter(
-    Annotated[Compared | Report | Query | Check, Field(discriminator="verb")]
-)
-"""Reads any document."""

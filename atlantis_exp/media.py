@@ -22,6 +22,15 @@ PURPLE, SKY = "#CC79A7", "#56B4E9"
 """Colours that people with any colour vision tell apart (Okabe and Ito, 2008)."""
 
 
+def png_of(figure: "Figure") -> bytes:
+    """Return a figure as PNG; unlike `savefig`, draw it only once."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(buffer)  # type: ignore[no-untyped-call]
+    return buffer.getvalue()
+
+
 def score_histogram(scores: Sequence[float], title: str, axis: tuple[float, float]) -> bytes:
     """Return a 256 x 256 PNG of a score distribution; scores beyond the axis are clipped to it.
 
@@ -38,7 +47,7 @@ def score_histogram(scores: Sequence[float], title: str, axis: tuple[float, floa
     axes.set_yticks([0, 0.05, 0.25, 0.5, 1], ["0", "5 %", "25 %", "50 %", "100 %"])
     axes.set_title(title, fontsize=8, parse_math=False)
     axes.set_xlabel(f"score (line: mean {np.mean(scores):,.0f})", fontsize=7)
-    return _png(figure)
+    return png_of(figure)
 
 
 def score_heatmap(
@@ -62,7 +71,7 @@ def score_heatmap(
     axes.set_ylabel("score", fontsize=7)
     axes.locator_params(axis="x", nbins=4)
     axes.xaxis.get_offset_text().set_fontsize(6)
-    return _png(figure)
+    return png_of(figure)
 
 
 def scene(
@@ -156,12 +165,6 @@ def _square() -> "tuple[Figure, Axes]":
     axes = figure.add_axes((0.17, 0.15, 0.78, 0.77))
     axes.tick_params(labelsize=6)
     return figure, axes
-
-
-def _png(figure: "Figure") -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    return buffer.getvalue()
 
 
 def _rgb(colour: str) -> tuple[int, ...]:

@@ -4,15 +4,19 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
+from pydantic import Field, TypeAdapter
 
 from atlantis_exp import terminal
-from atlantis_exp.documents import AnyDocument, Check, Compared, Query, Report
+from atlantis_exp.documents import Check, Compared, Query, Report
 from atlantis_exp.faults import Fault
 from atlantis_exp.sessions.contracts import check
 
+AnyDocument: TypeAdapter[Compared | Report | Query | Check] = TypeAdapter(
+    Annotated[Compared | Report | Query | Check, Field(discriminator="verb")]
+)
 Command = Callable[..., int]
 SCHEMA = Path(__file__).resolve().parents[1] / "docs" / "json.schema.json"
 

@@ -91,15 +91,11 @@ def named(columns: Iterable[str]) -> dict[str, str]:
     return names
 
 
-def list_out(arguments: list[str]) -> list[str]:
-    """Allow lists without brackets, as in `by=model,sampler`."""
-    # Hydra would read the commas as a sweep, and a second `=` as a mistake.
-    return [re.sub(r"^(by|runs|where|columns)=([^\[].*)$", listed, argument) for argument in as_texts(arguments)]
-
-
-def as_texts(arguments: Iterable[str]) -> list[str]:
-    """Quote the baseline, since Hydra refuses `lr=0.001` and reads some commits as numbers."""
-    return [re.sub(r"^baseline=(?!null$)([^'\"]+)$", r"baseline='\1'", argument) for argument in arguments]
+def list_out(arguments: Iterable[str]) -> list[str]:
+    """Allow lists without brackets, as in `by=model,sampler`, and quote the baseline."""
+    # Hydra would read the commas as a sweep, a second `=` as a mistake, some commits as numbers; it refuses `lr=0.001`.
+    quoted = (re.sub(r"^baseline=(?!null$)([^'\"]+)$", r"baseline='\1'", argument) for argument in arguments)
+    return [re.sub(r"^(against|by|columns|runs|where)=([^\[].*)$", listed, argument) for argument in quoted]
 
 
 def listed(match: re.Match[str]) -> str:

@@ -1,7 +1,6 @@
 """`python -m atlantis_exp decide model=cnn,resnet_fast`: train the seeds that a question needs, and answer it."""
 
 import dataclasses
-import re
 from collections.abc import Callable, Iterable
 from functools import cache, partial
 from typing import TYPE_CHECKING, Annotated
@@ -10,17 +9,16 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from atlantis_exp.commands.app import Asked, Verb
-from atlantis_exp.commands.compare import QuestionConfig, as_texts, listed
+from atlantis_exp.commands.compare import QuestionConfig, list_out
 from atlantis_exp.commands.jobs import training_of
 from atlantis_exp.commands.overrides import (
-    combined,
     flags_of,
+    jobs_of,
     key_of,
     launcher,
     read_override,
     refuse_twice,
     swept,
-    values_of,
     with_first_values,
 )
 from atlantis_exp.commands.train import train_on_a_node
@@ -50,11 +48,6 @@ _OWN = {field.name for field in dataclasses.fields(DecideConfig)} - {field.name 
 _CLOSED = _OWN | FREE | {"seed", "evaluation"}
 
 
-def _as_texts(arguments: Iterable[str]) -> list[str]:
-    """Return arguments with `against` as a list, which may be written without brackets."""
-    return [re.sub(r"^(against)=([^\[].*)$", listed, argument) for argument in as_texts(arguments)]
-
-
 def _launchers(texts: Iterable[str]) -> list[str]:
     """Return the overrides that choose a launcher and set it up."""
     return [text for text in texts if key_of(text).startswith(("hydra/launcher", "hydra.launcher."))]
@@ -62,7 +55,7 @@ def _launchers(texts: Iterable[str]) -> list[str]:
 
 def _first_contender(arguments: list[str]) -> list[str]:
     """Return the arguments of the first contender, without a launcher: its config has the keys that all share."""
-    flags = flags_of(arguments := _as_texts(arguments))
+    flags = flags_of(arguments := list_out(arguments))
     if flags.multirun:
         raise ConfigError("-m: decide plans its own sweeps; drop -m")
     refuse_twice(arguments)
@@ -88,7 +81,7 @@ def contest_of(asked: Asked[DecideConfig]) -> "Contest":
     """Return the contest that was asked for. Raises: ConfigError if it cannot be decided."""
     from atlantis_exp.sessions.deciding import Contest
 
-    config, typed = asked.config, _as_texts(asked.typed)
+    config, typed = asked.config, list_out(asked.typed)
     several = swept(typed)
     if several and config.against:
         raise ConfigError(f"{several[0]}: write several values or against=, not both")
@@ -101,12 +94,7 @@ def contest_of(asked: Asked[DecideConfig]) -> "Contest":
             raise ConfigError(
                 "experiment: a preset sets many keys; name those that differ, as in objective=dqn,quantile"
             )
-    contenders = [(), tuple(config.against)]
-    if not config.against:
-        choices = [
-            [f"{str(each.input_line).split('=', 1)[0]}={value}" for value in values_of(each)] for each in overrides
-        ]
-        contenders = list(combined(choices))
+    contenders = [(), tuple(config.against)] if config.against else [*jobs_of(overrides)]
     if len(contenders) < 2:
         raise ConfigError("nothing to decide between: give a key several values, as in model=cnn,resnet_fast")
     texts = flags_of(typed).overrides  # as typed, before Hydra resolved ${...}

@@ -36,13 +36,13 @@ def help_text(verb: str, arguments: Sequence[str]) -> str:
     """Return a verb's purpose, its keys and groups, and the keys of the options that the arguments name."""
     named = dict(text.split("=", 1) for text in arguments if "=" in text)
     preset = CONF / "experiment" / f"{named.get('experiment')}.yaml"
-    chosen = dict(_groups(preset)) | named if preset.is_file() else named
+    chosen = dict(groups_of(preset)) | named if preset.is_file() else named
     path = CONF / f"{'config' if verb == 'train' else verb}.yaml"
     refused = ("seed", "resume") if verb == "decide" else ()  # which it sets itself
     keys = [*_without(refused, _keys(path, ""))]
     own = {match[1] for line in keys if (match := _SHOWN.match(line))}
     short, full = [], []
-    groups = dict(_groups(path))
+    groups = dict(groups_of(path))
     for group, option in sorted(groups.items(), key=lambda item: (*_DAILY, item[0]).index(item[0])):
         line, *others = _of_group(group, chosen.get(group, option))
         if group in named or "all" in arguments:
@@ -59,7 +59,7 @@ def key_names(verb: str, arguments: Sequence[str]) -> list[str]:
     """Return the groups of a verb, then every key of the options that the arguments choose."""
     path = CONF / f"{'config' if verb == 'train' else verb}.yaml"
     lines = help_text(verb, [*arguments, "all"]).partition("\nFlags:")[0].splitlines()
-    return [*dict(_groups(path)), *(match[1] for line in lines if (match := _SHOWN.match(line)))]
+    return [*dict(groups_of(path)), *(match[1] for line in lines if (match := _SHOWN.match(line)))]
 
 
 def options_of(group: str) -> list[str]:
@@ -88,13 +88,13 @@ def _without(taken: Collection[str], lines: Iterable[str]) -> Iterator[str]:
             yield line
 
 
-def _groups(path: Path) -> Iterator[tuple[str, str]]:
+def groups_of(path: Path) -> Iterator[tuple[str, str]]:
     """Yield the groups and options in a file's defaults list and in the files that it names."""
     for line in _defaults(path):
         if match := _GROUP.fullmatch(line):
             yield match["group"], match["option"]
         elif (other := path.parent / f"{line.strip(' -')}.yaml").is_file():
-            yield from _groups(other)
+            yield from groups_of(other)
 
 
 def _defaults(path: Path) -> list[str]:

@@ -2,7 +2,6 @@
 
 import argparse
 import itertools
-import json
 import math
 import re
 import shutil
@@ -12,7 +11,7 @@ from difflib import SequenceMatcher
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar, cast
+from typing import Any, NoReturn, TypeVar
 
 from hydra import compose
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
@@ -21,15 +20,14 @@ from hydra.core.override_parser.types import Glob, IntervalSweep, Override, Rang
 from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
-from yaml import YAMLError, safe_load
+from yaml import YAMLError
 
 from atlantis_exp.checking import absolute, flatten, nearest
 from atlantis_exp.commands import CONF
 from atlantis_exp.commands.composing import admit_plugins, checked, composing
-from atlantis_exp.commands.helping import options_of
+from atlantis_exp.commands.helping import groups_of, options_of
 from atlantis_exp.components import KINDS, admitted, installed
 from atlantis_exp.faults import ConfigError
-from atlantis_exp.runs.files import SMALL, read_file
 from atlantis_exp.sessions.launchers import BASIC, Launcher
 from atlantis_exp.terminal import quoted
 
@@ -69,31 +67,15 @@ def flags_of(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def located(arguments: Sequence[str]) -> list[str]:
-    """Make paths in arguments absolute, and replace `sweep=FILE` by its overrides. Raises: ConfigError."""
+    """Make paths in arguments absolute. Raises: ConfigError."""
     flags = flags_of(arguments)
-    parts = (_from_file(text[6:]) if text.startswith("sweep=") else [text] for text in flags.overrides)
     return [
         *([f"--config-dir={flags.config_dir}"] if flags.config_dir else []),
         *(["-m"] if flags.multirun else []),
         *(["--cfg", flags.cfg] if flags.cfg else []),
         *(["--resolve"] if flags.resolve else []),
-        *(re.sub(r"^plugins=(?!null$)(.+)$", _located, text, flags=re.DOTALL) for text in itertools.chain(*parts)),
+        *(re.sub(r"^plugins=(?!null$)(.+)$", _located, text, flags=re.DOTALL) for text in flags.overrides),
     ]
-
-
-def _from_file(name: str) -> list[str]:
-    """Return the overrides in a YAML file: for each key a value, a list of values, or Hydra's syntax for them."""
-    try:
-        tree = safe_load(read_file(absolute("sweep", name).resolve(), SMALL))
-        return [_override(key, value) for key, value in flatten(tree).items()]
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError, YAMLError) as error:
-        reason = " ".join(str(error).split())
-        raise ConfigError(f"sweep={name}: write KEY: VALUE or KEY: [VALUES] on each line ({reason})") from None
-
-
-def _override(key: str, value: object) -> str:
-    values = value if isinstance(value, list) else [value]
-    return f"{key}={','.join(each if isinstance(each, str) else json.dumps(each) for each in values)}"
 
 
 _ITEM = re.compile(r"""(?:"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*'|[^,])+""")
@@ -143,7 +125,7 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
         _chosen.cache_clear()
     try:
         with composing():
-            configs = {tuple(job): _check_job(config_name, schema, job, own) for job in _jobs(overrides)}
+            configs = {job: _check_job(config_name, schema, job, own) for job in jobs_of(overrides)}
         return {((f"--config-dir={own}", *job) if own else job): config for job, config in configs.items()}
     except (HydraException, OmegaConfBaseException) as error:
         reason = f": {error.__cause__}" if isinstance(error.__cause__, OmegaConfBaseException) else ""
@@ -247,18 +229,13 @@ def _is_hydras(override: Override) -> bool:
     return re.match(r"hydra([./]|$)", override.key_or_group) is not None
 
 
-def _jobs(overrides: list[Override]) -> Iterator[list[str]]:
-    """Return the overrides of each job."""
+def jobs_of(overrides: Sequence[Override]) -> Iterator[tuple[str, ...]]:
+    """Return the overrides of each job. Raises: ConfigError for too many."""
     choices = []
     for override in overrides:
         key = str(override.input_line).split("=", 1)[0]
         is_sweep = override.is_sweep_override()
         choices.append([f"{key}={each}" for each in values_of(override)] if is_sweep else [str(override.input_line)])
-    return map(list, combined(choices))
-
-
-def combined(choices: Sequence[Sequence[str]]) -> Iterator[tuple[str, ...]]:
-    """Return the product of choices. Raises: ConfigError for too many."""
     if (count := math.prod(map(len, choices))) > _MOST_JOBS:
         raise ConfigError(f"these values make {count:,} jobs; write values for at most {_MOST_JOBS:,}")
     return itertools.product(*choices)
@@ -304,7 +281,7 @@ def is_longer(values: RangeSweep, most: int) -> bool:
     return values.step != 0 and abs(values.stop - values.start) > most * abs(values.step)
 
 
-def _check_job(config_name: str, schema: type[T], texts: list[str], own: Path | None) -> T:
+def _check_job(config_name: str, schema: type[T], texts: Sequence[str], own: Path | None) -> T:
     parsed, groups = [read_override(text) for text in texts], _groups(config_name)
     overrides = dict(zip(texts, parsed, strict=True))
     chosen = tuple(text for text, override in overrides.items() if _key(override) in groups)
@@ -385,13 +362,7 @@ def _keys(config_name: str, choices: tuple[str, ...], own: Path | None) -> froze
 @cache
 def _groups(config_name: str) -> frozenset[str]:
     """Return the groups of a verb's defaults list, with the package that they fill: `sampler@samplers.uniform`."""
-    groups: set[str] = set()
-    for entry in cast(DictConfig, OmegaConf.load(CONF / f"{config_name}.yaml")).get("defaults", ()):
-        if isinstance(entry, DictConfig):
-            groups |= {str(group) for group in entry}
-        elif entry != "_self_":
-            groups |= _groups(entry)
-    return frozenset(groups)
+    return frozenset(dict(groups_of(CONF / f"{config_name}.yaml")))
 
 
 def _key(override: Override) -> str:

@@ -211,19 +211,18 @@ def equivalence(plan: Plan, spread: float, pairs: int = 1) -> float:
     return float((-stdtrit(freedom, error / 2) + stdtrit(freedom, 0.9)) * np.sqrt(2 / plan.looks[-1]) * spread)
 
 
-def power(plan: Plan, difference: float, spread: float, pairs: int = 1) -> tuple[float, float]:
-    """Return the probability that the plan finds a difference, and the mean number of seeds per group that it takes.
+def power(plan: Plan, difference: float, spread: float, pairs: int = 1) -> float:
+    """Return the probability that the plan finds a difference.
 
-    Both use the noncentral t of each look alone, as if later looks found all that an earlier one finds: this slightly
-    understates the power and overstates the seeds. Arguments as for `detectable`.
+    It uses the noncentral t of each look alone, as if later looks found all that an earlier one finds, so it slightly
+    understates the power. Arguments as for `detectable`.
     """
     looks = np.array(plan.looks)
     freedom = 2 * (looks - 1)
     critical = -stdtrit(freedom, _errors(plan) / pairs / 2)
     noncentrality = abs(difference) / (spread * np.sqrt(2 / looks))
     found = 2 - nctdtr(freedom, noncentrality, critical) - nctdtr(freedom, -noncentrality, critical)  # either tail
-    by_now = np.maximum.accumulate(found)
-    return float(by_now[-1]), float(looks[0] + (np.diff(looks) * (1 - by_now[:-1])).sum())
+    return float(found.max())
 
 
 @dataclass(frozen=True)
@@ -275,18 +274,14 @@ def may_be_best(decision: Decision) -> list[str]:
 
     With at least 1 - the plan's error they include the best, if all pairs were compared.
     """
-    beaten = {
-        verdict.group if verdict.said == "worse" else verdict.other
-        for verdict in decision.verdicts
-        if verdict.said in ("better", "worse")
-    }
+    beaten = {verdict.leading.other for verdict in decision.verdicts if verdict.said in ("better", "worse")}
     return sorted(set(_names((verdict.group, verdict.other) for verdict in decision.verdicts)) - beaten)
 
 
 def seeds_needed(difference: float, spread: float, error: float = 0.05, pairs: int = 1) -> int | None:
     """Return the seeds per group of the shortest plan that finds a difference with 80 %; None beyond a thousand."""
     sizes = range(FEWEST_SEEDS, 1_001)
-    return next((n for n in sizes if power(Plan(looks_up_to(n), error), difference, spread, pairs)[0] >= 0.8), None)
+    return next((n for n in sizes if power(Plan(looks_up_to(n), error), difference, spread, pairs) >= 0.8), None)
 
 
 def improvement(one: npt.ArrayLike, other: npt.ArrayLike) -> tuple[float, float, float]:

@@ -15,7 +15,7 @@ import numpy as np
 from atlantis_exp.comparison.gather import AXES
 from atlantis_exp.comparison.published import Table, random_line
 from atlantis_exp.comparison.tables import Comparison
-from atlantis_exp.media import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
+from atlantis_exp.media import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, png_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -126,18 +126,9 @@ def _render(plot: Callable[["Axes"], None], title: str, alt: str, height: float 
     with rc_context(_STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(4.8, height), dpi=150, facecolor="white", layout="constrained")
         plot(figure.add_subplot())
-        png = _png(figure)
+        png = png_of(figure)
         figure.set_layout_engine("none")  # keep the layout for both pictures
         return Drawn(title, alt, png, _svg(figure, alt))
-
-
-def _png(figure: "Figure") -> bytes:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    buffer = io.BytesIO()
-    # `savefig` would draw twice, once for the layout alone.
-    FigureCanvasAgg(figure).print_png(buffer)  # type: ignore[no-untyped-call]
-    return buffer.getvalue()
 
 
 def _svg(figure: "Figure", alt: str) -> str:

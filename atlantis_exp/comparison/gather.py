@@ -109,11 +109,6 @@ class Training(Run):
         """The score that it counts by."""
         return interquartile_mean(self.episodes.scores) if self.training_score is None else self.training_score
 
-    @property
-    def has_collapsed(self) -> bool:
-        """Whether the network chose one action only."""
-        return self.policy.startswith("collapsed")
-
 
 @dataclass(frozen=True)
 class Player(Run):

@@ -126,7 +126,7 @@ def _looked_at(facts: Facts) -> Iterator[tuple[Answer, Look, Verdict]]:
 def unusual_runs(facts: Facts) -> Iterator[str]:
     """Name runs whose policy, replay memory or code makes scores less meaningful, and runs that play alike."""
     for label, runs in facts.groups.items():
-        if names := [run.name for run in runs if run.has_collapsed]:
+        if names := [run.name for run in runs if run.policy.startswith("collapsed")]:
             yield (
                 f"{len(names)} of {len(runs)} runs of {label} collapsed to one action, so their scores say little "
                 f"about learning: {listed(names)}."

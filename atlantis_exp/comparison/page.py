@@ -38,7 +38,6 @@ COLUMNS: Mapping[str, Sequence[str]] = {
     ),
     "why": ("group", "mean", "frames_mean", "time_cap_share", "points_per_1000_frames"),
     "views": ("view", "at", "leader", "leader_score", "other", "other_score", "difference"),
-    "improvement": ("group", "over", "probability"),
     "runs": (
         *("run", "group", "seed", "frames", "hours", "flops", "epsilon", "score"),
         *("episodes", "mean", "median", "low", "high", "policy", "same_as"),
@@ -72,7 +71,6 @@ _TITLE = {
     "at": "up to",
     "leader_score": "its score",
     "other_score": "its score",
-    "probability": "probability of improvement",
     "flops": "FLOPs",
     "same_as": "plays as",
     "random": "chance",

@@ -6,7 +6,6 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from itertools import combinations
 from math import isnan
 from typing import Literal
 
@@ -24,7 +23,7 @@ from atlantis_exp.comparison.verdict import Answer, Group, Question, answer, fam
 from atlantis_exp.comparison.words import measure, said
 from atlantis_exp.components import facts_of, title_of
 from atlantis_exp.games import Game
-from atlantis_exp.statistics import Scores, human_normalised, probability_of_improvement, summarize
+from atlantis_exp.statistics import Scores, human_normalised, summarize
 
 Groups = Mapping[str, Sequence[Training]]
 
@@ -67,15 +66,8 @@ class Comparison:
                 "verdicts": verdicts,
                 "scores": [row | {"seeds": seeds[row["family"], row["group"]]} for row in scores],
                 "looks": [
-                    {
-                        "family": each.family.name,
-                        "planned": each.family.plan.looks,
-                        "taken": [look.size for look in each.decision.looks],
-                        "next": each.decision.next_look,
-                        "error": each.family.plan.error,
-                        "spent": each.decision.spent,
-                    }
-                    for each in self.answers
+                    row | {key: row[key].split() for key in ("planned", "taken")} | {"next": row["next_look"] or None}
+                    for row in self.tables["plan"]
                 ],
             }
         )
@@ -120,10 +112,6 @@ def compare(
         "looks": [row for each in answers for row in _looks(each)],
         "evaluation": [_evaluation(label, runs, game) for label, runs in groups.items()],
         "why": [_why(label, runs, game.sources) for label, runs in groups.items()],
-        "improvement": [
-            {"group": one, "over": other, "probability": probability_of_improvement(_pooled(mine), _pooled(theirs))}
-            for (one, mine), (other, theirs) in combinations(groups.items(), 2)
-        ],
         "views": _views(groups),
         "runs": _runs(groups),
         "curves": [row for axis in AXES for label, runs in groups.items() for row in _curve(axis, label, runs)],
@@ -283,12 +271,8 @@ def _runs(groups: Groups) -> Table:
                 "seed": training.config["seed"],
                 **{axis: training.curve[axis][-1] if axis in training.curve else "" for axis in AXES},
                 "epsilon": training.config["evaluation.epsilon"],
-                "episodes": summary.episodes,
                 "score": training.score,
-                "mean": summary.mean,
-                "median": summary.median,
-                "low": summary.low,
-                "high": summary.high,
+                **{key: getattr(summary, key) for key in ("episodes", "mean", "median", "low", "high")},
                 "policy": training.policy,
                 "same_as": same_as if same_as != training.name else "",
             }

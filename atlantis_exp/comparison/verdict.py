@@ -110,7 +110,17 @@ def families(groups: Sequence[Group], question: Question) -> list[Family]:
     members = [(name, values) for name, values in averaged if values]
     members.append((",".join(question.by[index] for index in keys), alone))
     base = _baseline(members, groups, keys, question)
-    return [_family(name, values, groups, question, len(members), base.get(name)) for name, values in members]
+    found = []
+    for name, values in members:
+        error = question.error / len(members)
+        plan = Plan(looks_up_to(question.seeds), error, question.delta, question.relative, base.get(name))
+        seeds = {}
+        for value, of in values.items():
+            common = sorted(set.intersection(*(set(group.seeds) for group in of)))
+            seeds[value] = {seed: float(np.mean([group.seeds[seed] for group in of])) for seed in common}
+        used = {group.label for of in values.values() for group in of}
+        found.append(Family(name, plan, seeds, values, [group.label for group in groups if group.label not in used]))
+    return found
 
 
 def _averaged(groups: Sequence[Group], index: int) -> dict[str, list[Group]]:
@@ -149,23 +159,6 @@ def _baseline(
     if found:
         raise ConfigError(f"baseline={asked}: could be any of {', '.join(found.values())}")
     raise ConfigError(f"baseline={asked}: no such group; {nearest(asked, {value for _, value, _ in choices})}")
-
-
-def _family(
-    name: str,
-    values: dict[str, list[Group]],
-    groups: Sequence[Group],
-    question: Question,
-    among: int,
-    baseline: str | None,
-) -> Family:
-    plan = Plan(looks_up_to(question.seeds), question.error / among, question.delta, question.relative, baseline)
-    seeds = {}
-    for value, members in values.items():
-        common = sorted(set.intersection(*(set(group.seeds) for group in members)))
-        seeds[value] = {seed: float(np.mean([group.seeds[seed] for group in members])) for seed in common}
-    used = {group.label for members in values.values() for group in members}
-    return Family(name, plan, seeds, values, [group.label for group in groups if group.label not in used])
 
 
 def answer(asked: Sequence[Family], record: Mapping[str, Sequence[Look]], now: bool = False) -> list[Answer]:

@@ -7,7 +7,7 @@ decision that was killed.
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from heapq import heapreplace
 from itertools import pairwise, product
@@ -21,10 +21,10 @@ from atlantis_exp.checking import digest, flatten, to_dict
 from atlantis_exp.comparison.choosing import mixed_protocol, resolve, shortened, values_in
 from atlantis_exp.comparison.decision import detectable, equivalence, looks_up_to
 from atlantis_exp.comparison.estimands import score_of
+from atlantis_exp.comparison.page import plain
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.comparison.tables import Comparison
 from atlantis_exp.comparison.verdict import Group, Question, families, wanted
-from atlantis_exp.comparison.words import points
 from atlantis_exp.config import Config
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
@@ -42,37 +42,26 @@ from atlantis_exp.tracking.publishing import catch_up
 from atlantis_exp.training.forecast import duration
 
 
+@dataclass(eq=False)
 class Contest:
     """A question about contenders, and the way to train them.
-
-    Args:
-        chosen: the overrides of each contender that tell it from the others.
-        several: the overrides with several values, as typed; empty if `against` makes the contenders.
-        fixed: the overrides that all contenders share.
-        launcher: runs the trainings; None: as many at a time as the machine runs well.
-        on_a_node: trains the job of some overrides in a process that Slurm has started.
-        job_of: returns the training of some overrides.
-        command: continues the decision.
 
     Raises: ConfigError if two contenders are the same training, their scores are not comparable, a run was trained for
     longer, or the baseline is not a contender.
     """
 
-    def __init__(
-        self,
-        question: Question,
-        chosen: Sequence[tuple[str, ...]],
-        *,
-        several: Sequence[str],
-        fixed: Sequence[str],
-        launcher: Launcher | None,
-        on_a_node: Callable[[Sequence[str]], None],
-        job_of: Callable[[tuple[str, ...]], Job],
-        command: str,
-    ) -> None:
-        self.several, self.launcher, self.command = several, launcher, command
-        self.on_a_node, self._job_of = on_a_node, job_of
-        jobs = {each: job_of((*replaced(fixed, *each),)) for each in chosen}
+    question: Question
+    chosen: Sequence[tuple[str, ...]]  # the overrides of each contender that tell it from the others
+    several: Sequence[str]  # the overrides with several values, as typed; empty if `against` makes the contenders
+    fixed: Sequence[str]  # the overrides that all contenders share
+    launcher: Launcher | None  # runs the trainings; None: as many at a time as the machine runs well
+    on_a_node: Callable[[Sequence[str]], None]  # trains the job of some overrides in a process that Slurm has started
+    job_of: Callable[[tuple[str, ...]], Job]  # returns the training of some overrides
+    command: str  # continues the decision
+
+    def __post_init__(self) -> None:
+        question, chosen = self.question, self.chosen
+        jobs = {each: self.job_of((*replaced(self.fixed, *each),)) for each in chosen}
         facts = {each: flatten(to_dict(job.config)) for each, job in jobs.items()}
         for key in question.by:
             if not all(resolve(key, each) for each in facts.values()):
@@ -89,10 +78,8 @@ class Contest:
                 raise ConfigError(f"{' '.join(each)}: makes the same run as {_said(twin)}")
         if mixed := mixed_protocol({groups[each].label: facts[each] for each in chosen}, by):
             raise ConfigError(f"{mixed[1]}; give that key itself several values, or train them under one protocol")
-        explored = [
-            {key: value for key, value in each.items() if key.startswith("epsilon.")} for each in facts.values()
-        ]
-        if question.score == "training" and any(each != explored[0] for each in explored):
+        explored = {digest({key: each[key] for key in each if key.startswith("epsilon.")}) for each in facts.values()}
+        if question.score == "training" and len(explored) > 1:
             raise ConfigError("score=training: depends on epsilon, in which contenders differ; use score=last")
         self.families = families(list(groups.values()), self.question)  # without seeds
         for folder in self.runs:
@@ -118,11 +105,10 @@ class Contest:
         identity = {
             **self.question.identity,
             "runs": sorted(folder.name for folder in self.runs),
-            "budget.steps": self.config.budget.steps,
+            "budget.steps": None,
+            **self.config.budget.limits,  # older decisions lack those that are not set
             "evaluation.epsilon": self.config.evaluation.epsilon,
         }
-        if self.config.budget.flops is not None:  # older decisions lack the key
-            identity["budget.flops"] = self.config.budget.flops
         return RunFolder(self.outputs / "decisions" / f"decide-{digest(identity)}")
 
     @property
@@ -163,19 +149,16 @@ class Contest:
         overrides = (*job.overrides, f"seed={seed}")
         # A value may follow from the seed, here or in a file of the user's: compose anew.
         if any("${" in text or text.startswith(("--config-dir=", "plugins=")) for text in overrides):
-            return self._job_of(overrides)
+            return self.job_of(overrides)
         return replace(job, config=replace(job.config, seed=seed), overrides=overrides)
 
     def run(self, label: str, seed: int) -> RunFolder:
         """Return the folder of that training."""
         return RunFolder.of(self.job(label, seed).config)
 
-    def _has_ended(self, folder: RunFolder) -> bool:
-        return folder.ended(self.config.budget.limits) is not None
-
     def look(self) -> Comparison | None:
         """Compare the ended runs and take the look that is due; return None before the first one is possible."""
-        ended = [folder.name for folder in self.runs if self._has_ended(folder)]
+        ended = [folder.name for folder in self.runs if folder.ended(self.config.budget.limits)]
         self.folder.write_config({"command": self.command, "runs": ended})
         if any(self.left(label, range(self.looks[0])) for label in self.contenders):
             return None
@@ -198,7 +181,7 @@ class Contest:
 
     def left(self, label: str, seeds: Iterable[int]) -> list[int]:
         """Return the seeds with which a contender has not been trained to the end."""
-        return [seed for seed in seeds if not self._has_ended(self.run(label, seed))]
+        return [seed for seed in seeds if not self.run(label, seed).ended(self.config.budget.limits)]
 
     def jobs(self, needed: Mapping[str, Sequence[int]]) -> list[Job]:
         """Return the needed trainings: the first seed of every contender before the second."""
@@ -334,16 +317,11 @@ def _spread(contest: Contest) -> tuple[float, str] | None:
 
 def _write(journal: Journal, contest: Contest, comparison: Comparison) -> None:
     """Write the looks taken and the answer to the page."""
-    table = ["| look at seeds | pair | said | difference | interval | error spent |", f"|{' --- |' * 6}"] + [
-        f"| {look.size} | {verdict.group} over {verdict.other} | {verdict.said} | {points(verdict.difference)} "
-        f"| {points(verdict.low)} to {points(verdict.high)} | {look.error:.2%} |"
-        for answer in comparison.answers
-        for look in answer.decision.looks
-        for verdict in look.verdicts
-    ]
+    header, *rows = plain("looks", comparison.tables["looks"])
+    table = "\n".join(f"| {' | '.join(row)} |" for row in (header, len(header) * ["---"], *rows))
     commands = [f"Continue or report: `{contest.command}`", f"Compare its runs again: `{contest.comparing}`"]
     journal.tags({"verdict": comparison.verdict})
     # MLflow cuts a long note, so what the comparison's page has, too, comes last.
     said = [comparison.verdict, *commands, *comparison.others, *comparison.caveats]
-    journal.note("\n\n".join([*said, "\n".join(table)]))
+    journal.note("\n\n".join([*said, table]))
     journal.flush()

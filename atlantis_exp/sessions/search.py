@@ -114,14 +114,9 @@ class Trials:
 
     def __init__(self, asked: Search, train: Train = train) -> None:
         config = asked.corner.config
-        facts: dict[str, Any] = {
-            "space": dict(asked.texts),
-            "training": config.science(),
-            "budget.steps": config.budget.steps,
-        }
-        if config.budget.flops is not None:  # older searches lack the key
-            facts["budget.flops"] = config.budget.flops
-        if asked.seeds > 1:  # nor do they have this one
+        facts: dict[str, Any] = {"space": dict(asked.texts), "training": config.science(), "budget.steps": None}
+        facts |= config.budget.limits  # older searches lack those that are not set, and seeds
+        if asked.seeds > 1:
             facts["seeds"] = asked.seeds
         name = asked.name or f"search-{digest(facts)}"
         self.asked, self._train = asked, train

@@ -7,7 +7,7 @@ from pathlib import Path
 from atlantis_exp import terminal
 from atlantis_exp.config import PathsConfig
 from atlantis_exp.faults import Fault
-from atlantis_exp.sessions.syncing import publish_all, tell
+from atlantis_exp.sessions.syncing import publish_all
 from atlantis_exp.tracking.publishing import lacking
 from atlantis_exp.tracking.store import Store
 from atlantis_exp.tracking.views import COMPARISONS, START, address, site
@@ -24,8 +24,8 @@ def serve(*, port: int, paths: PathsConfig) -> None:
     outputs = Path(paths.outputs)
     store = Store(outputs)
     if missing := lacking(outputs):
-        with suppress(Fault):  # `tell` warns of each run that fails
-            tell(store.uri, publish_all(outputs, store, missing), is_first=True)
+        with suppress(Fault):  # a warning names each run that fails
+            publish_all(outputs, store, missing)
     try:
         with terminal.working("preparing MLflow's store"):
             store.prepare()

@@ -3,9 +3,8 @@
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from atlantis_exp import terminal
 from atlantis_exp.config import PathsConfig, TrackingConfig
@@ -13,14 +12,6 @@ from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder, all_folders
 from atlantis_exp.tracking.mirror import publish
 from atlantis_exp.tracking.store import Store, first_line
-
-
-class Sent(NamedTuple):
-    """The outcome of publishing one run."""
-
-    outcome: str  # published, up to date or failed
-    run: str
-    reason: str = ""
 
 
 def sync(
@@ -41,7 +32,7 @@ def sync(
     try:
         while True:
             try:
-                tell(store.uri, publish_all(outputs, store), is_first)
+                publish_all(outputs, store, is_first=is_first)
             except Fault as fault:
                 if every is None:
                     raise
@@ -54,38 +45,36 @@ def sync(
         sys.exit(130)  # 128 + SIGINT; sent runs are recorded
 
 
-def tell(uri: str, all_sent: Iterable[Sent], is_first: bool) -> None:
-    """Print the outcomes of runs, and counts at first or after a change. Raises: Fault if a run failed."""
-    counts: Counter[str] = Counter()
-    for sent in all_sent:
-        run = terminal.harmless(sent.run).replace("\n", " ")
-        counts[sent.outcome] += 1
-        if sent.reason:
-            terminal.warn(f"{run}: {sent.outcome}: {sent.reason}")
-        elif sent.outcome == "published":
-            print(f"  published   {run}", flush=True)
-    if is_first or counts["published"] or counts["failed"]:
-        listed = ", ".join(f"{count} {outcome}" for outcome, count in sorted(counts.items()))
-        print(f"to {uri}: {counts.total()} runs{': ' if listed else ''}{listed}", flush=True)
-    if counts["failed"]:
-        raise Fault(f"to {uri}: {counts['failed']} of {counts.total()} runs failed")
+def publish_all(
+    outputs: Path, store: Store, folders: Sequence[RunFolder] | None = None, *, is_first: bool = True
+) -> None:
+    """Publish run folders, by default all under `outputs`; print changed ones, and counts at first or after a change.
 
-
-def publish_all(outputs: Path, store: Store, folders: Sequence[RunFolder] | None = None) -> Iterator[Sent]:
-    """Publish run folders, by default all under `outputs`, and yield the outcomes. Raises: Fault for the store."""
+    Raises: Fault if the store cannot be reached or a run failed.
+    """
     try:
         with terminal.working(f"asking {store.uri} for its runs"):
             listed = {run.info.run_id for run in store.runs()}
     except Exception as error:
         raise store.explained(error) from None
+    counts: Counter[str] = Counter()
     folders = all_folders(outputs) if folders is None else folders
     for folder in (each.path for each in reversed(folders)):  # sweeps before runs, which publish theirs
-        run = str(folder.relative_to(outputs))
+        run = terminal.harmless(str(folder.relative_to(outputs))).replace("\n", " ")
         try:
             with terminal.working(f"publishing {run}"):
                 was_behind = publish(folder, store, is_primary=False, listed=listed)
-            yield Sent("published" if was_behind else "up to date", run)
         except Exception as error:
             if (fault := store.fault(error)) is not None:
                 raise fault from None
-            yield Sent("failed", run, first_line(error))
+            counts["failed"] += 1
+            terminal.warn(f"{run}: failed: {first_line(error)}")
+            continue
+        counts["published" if was_behind else "up to date"] += 1
+        if was_behind:
+            print(f"  published   {run}", flush=True)
+    if is_first or counts["published"] or counts["failed"]:
+        listing = ", ".join(f"{count} {outcome}" for outcome, count in sorted(counts.items()))
+        print(f"to {store.uri}: {counts.total()} runs{': ' if listing else ''}{listing}", flush=True)
+    if counts["failed"]:
+        raise Fault(f"to {store.uri}: {counts['failed']} of {counts.total()} runs failed")

@@ -43,7 +43,7 @@ FLAGS = (
 STRANGE = (
     *("=", "==", "=1", "~", "+", "++", "a", "a.b", "a.b=c", ".=1", "model@x=cnn", "sampler@samplers.uniform=top_half"),
     *("hydra.run.dir=/tmp", "hydra/launcher=joblib", "hydra.launcher.n_jobs=0", "hydra/launcher=slurm", "hydra={a:1}"),
-    *("plugins=x", "plugins=[./x.py]", "plugins={a:1}", "sweep=x.yaml", "sweep=.", "from=x", "to=http://u:p@h", "to=."),
+    *("plugins=x", "plugins=[./x.py]", "plugins={a:1}", "from=x", "to=http://u:p@h", "to=."),
 )
 
 

@@ -321,26 +321,6 @@ def test_the_path_of_a_plugin_may_hold_a_comma(typed: str) -> None:
     assert others == (["other"] if "other" in typed else [])
 
 
-def test_a_sweep_kept_in_a_file_is_the_one_typed_out(tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text(
-        "model: [cnn, resnet]\noptimizer: {lr: [1e-3, 0.0001]}\nseed: range(0,2)\nenv.crop: [[0, 160, 210, 0]]\n"
-        "budget.steps: 100\nthreads: null\n"
-    )
-    texts = ["model=cnn,resnet", "optimizer.lr=1e-3,0.0001", "seed=range(0,2)", "env.crop=[0, 160, 210, 0]"]
-    (tmp_path / "link.yaml").symlink_to(tmp_path / "mine.yaml")
-    found = located(["-m", f"sweep={tmp_path / 'link.yaml'}", "threads=1"])
-    assert found == ["-m", *texts, "budget.steps=100", "threads=null", "threads=1"]
-    assert len(check("config", Config, found[:-1])) == 8
-
-
-@pytest.mark.parametrize("text", ["", "a", "- 1", "a: [", "a: !!python/name:os.system", "a: 2024-01-01", None])
-def test_a_file_that_is_no_sweep_is_one_line(tmp_path: Path, text: str | None) -> None:
-    if text is not None:
-        (tmp_path / "mine.yaml").write_text(text)
-    with pytest.raises(ConfigError, match=r"^sweep=.*mine\.yaml: write KEY: VALUE .*$"):
-        located([f"sweep={tmp_path / 'mine.yaml'}"])
-
-
 @pytest.mark.parametrize(
     "line",
     ["objective=quantile,double_quantile objective.quantiles=11", "lr_schedule=linear,one_cycle lr_schedule.end=0.1"],

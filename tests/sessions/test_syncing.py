@@ -23,7 +23,7 @@ from atlantis_exp.commands.sync import SyncConfig
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import Result, RunFolder
 from atlantis_exp.runs.journal import Journal, adopt, read_commit
-from atlantis_exp.sessions.syncing import Sent, publish_all, sync, tell
+from atlantis_exp.sessions.syncing import publish_all, sync
 from atlantis_exp.tracking.mirror import publish
 from atlantis_exp.tracking.publishing import catch_up, unfinished
 from atlantis_exp.tracking.store import Store, all_pages
@@ -248,7 +248,9 @@ def test_it_looks_again_and_says_only_what_changed_until_it_is_interrupted(
     assert third.endswith("1 of 2 runs failed; trying again in 30 s\n")
 
 
-def test_a_store_that_fails_in_the_middle_ends_it_and_a_folder_that_fails_does_not(tmp_path: Path) -> None:
+def test_a_store_that_fails_in_the_middle_ends_it_and_a_folder_that_fails_does_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     class Failing(Store):
         is_gone = False
 
@@ -258,10 +260,12 @@ def test_a_store_that_fails_in_the_middle_ends_it_and_a_folder_that_fails_does_n
     a_sweep_of_one(tmp_path, "plain")
     (tmp_path / "sweeps/sweep-plain/commit.json").write_text("{")
     store = Failing(tmp_path)
-    assert [sent.outcome for sent in publish_all(tmp_path, store)] == ["failed", "failed"]  # the run's parent, too
+    with pytest.raises(Fault, match="2 of 2 runs failed"):  # the run's parent, too
+        publish_all(tmp_path, store)
+    assert capsys.readouterr().err.count(": failed: ") == 2
     store.is_gone = True
     with pytest.raises(Fault, match="no answer"):
-        [*publish_all(tmp_path, store)]
+        publish_all(tmp_path, store)
 
 
 @pytest.mark.slow
@@ -302,16 +306,23 @@ def test_a_server_that_drips_is_given_up(tmp_path: Path) -> None:
         began = time.monotonic()
         store = Store(tmp_path, tracking_uri=f"http://127.0.0.1:{server.server_address[1]}", patience=2)
         with pytest.raises(Fault, match=r"cannot be reached: TooSlow.*within 2 seconds"):
-            [*publish_all(tmp_path, store)]
+            publish_all(tmp_path, store)
         server.shutdown()
     assert len(dripped) > 5
     assert time.monotonic() - began < 30
 
 
-def test_a_folder_is_named_in_one_line_that_a_terminal_does_not_obey(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_is_named_in_one_line_that_a_terminal_does_not_obey(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = RunFolder(tmp_path / "a\x1b]52;c;cm0=\x07\nto y: 9 runs\x9b2J")
+    folder.path.mkdir()
+    (folder.path / "commit.json").write_text("{")
     with pytest.raises(Fault, match="1 of 1 runs failed"):
-        tell("x", [Sent("failed", "a\x1b]52;c;cm0=\x07\nto y: 9 runs", "no\x9b2J")], is_first=True)
-    assert capsys.readouterr().err == "atlantis_exp: a]52;c;cm0= to y: 9 runs: failed: no2J\n"
+        publish_all(tmp_path, Store(tmp_path), [folder])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("atlantis_exp: a]52;c;cm0= to y: 9 runs2J: failed: ")
+    assert line.isprintable()
 
 
 def test_a_list_without_end_is_refused() -> None:

@@ -133,7 +133,7 @@ def test_a_database_that_cannot_be_used_is_one_line_with_the_remedy_for_every_co
     remedy = rf"move it away, and .* sync paths.outputs={tmp_path} rebuilds it"
     said = rf"{tmp_path}/mlflow.db cannot be used \(.*\): {remedy}"
     with pytest.raises(Fault, match=said):
-        [*publish_all(tmp_path, Store(tmp_path))]
+        publish_all(tmp_path, Store(tmp_path))
     with pytest.raises(Fault, match=said):
         Store(tmp_path).prepare()
     publisher = Publisher(folder, Store(tmp_path))
