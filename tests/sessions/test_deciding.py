@@ -147,10 +147,8 @@ def test_decided_pairs_are_dropped_and_each_look_is_on_the_page_once(
     assert contest.folder.title == "decide optimizer.lr=0.001,0.002,0.003"
     assert said["verdict"].startswith("lr=0.001 plays better than lr=0.002")
     note = said[NOTE]
-    looks = re.findall(
-        r"^\| (\d+) \| (\d+) \| ([\d.]+%) \| (.+) \| (.+) \| [\d,]+ \(.+ to .+\) \| (.+) \|$", note, re.M
-    )
-    assert looks == [
+    row = r"^\| (\d+) \| (\d+) \| ([\d.]+%) \| (.+) \| (.+) \| [\d,]+ \(.+ to .+\) \| (.+) \|$"
+    assert re.findall(row, note, re.MULTILINE) == [
         ("1", "5", "1.25%", "lr=0.001", "lr=0.002", "better"),
         ("1", "5", "1.25%", "lr=0.001", "lr=0.003", "better"),
         ("1", "5", "1.25%", "lr=0.002", "lr=0.003", "not decided"),
