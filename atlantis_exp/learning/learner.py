@@ -173,7 +173,7 @@ class Learner(ActionValues):
 
     def evaluated_q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
         """Return the values (B, A) that `evaluated` gives states (B, C, H, W) in 0..255; change nothing."""
-        return self.all_values(self._evaluated, states)
+        return self.q_values(states, self._evaluated)
 
     @property
     def learning_rate(self) -> float:

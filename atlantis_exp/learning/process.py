@@ -12,14 +12,6 @@ _M_TRIM_THRESHOLD = -1
 _M_MMAP_MAX = -4
 
 
-def set_up_process(threads: int) -> None:
-    """Set torch's threads, make it deterministic, and keep the memory that it frees."""
-    torch.set_num_threads(threads)
-    torch.backends.cudnn.deterministic = True  # else some GPU kernels add in any order
-    torch.backends.cudnn.allow_tf32 = False  # fp32 means float32, not TensorFloat-32
-    keep_freed_memory()
-
-
 def keep_freed_memory() -> None:
     """Let glibc's malloc keep freed memory for the next allocation; without glibc, do nothing.
 

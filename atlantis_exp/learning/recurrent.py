@@ -33,7 +33,7 @@ class RecurrentLearner(Learner):
         self, states: npt.NDArray[np.uint8], memory: npt.NDArray[np.float32]
     ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
         """Return the values (B, A) of the network to evaluate, and its memory (B, units) after the states."""
-        return self.all_steps(self._evaluated, states, memory)
+        return self.step(states, memory, self._evaluated)
 
     def _passes(self, online: nn.Module, target_network: nn.Module, *batch: npt.NDArray[Any]) -> Passed:
         """Pass a shard of `Sequences` through both networks."""

@@ -100,12 +100,9 @@ class ActionValues:
             self._threads = ThreadPoolExecutor(shards, "learner", partial(torch.set_num_threads, 1))
         self._online = Replicas(network, self.dtype, shards)
 
-    def q_values(self, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
-        """Return the network's values (B, A) of states (B, C, H, W) in 0..255; change nothing."""
-        return self.all_values(self._online, states)
-
-    def all_values(self, replicas: Replicas, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
-        return np.concatenate(self._map_shards(partial(self._values, replicas), self._shards(states)))
+    def q_values(self, states: npt.NDArray[np.uint8], replicas: Replicas | None = None) -> npt.NDArray[np.float32]:
+        """Return the values (B, A) that the network, or its replicas, give states (B, C, H, W) in 0..255."""
+        return np.concatenate(self._map_shards(partial(self._values, replicas or self._online), self._shards(states)))
 
     @torch.inference_mode()
     def _values(self, replicas: Replicas, shard: int, states: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
@@ -114,15 +111,10 @@ class ActionValues:
         return values
 
     def step(
-        self, states: npt.NDArray[np.uint8], memory: npt.NDArray[np.float32]
+        self, states: npt.NDArray[np.uint8], memory: npt.NDArray[np.float32], replicas: Replicas | None = None
     ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        """Return a recurrent network's values (B, A) of states and its memory (B, units) after them."""
-        return self.all_steps(self._online, states, memory)
-
-    def all_steps(
-        self, replicas: Replicas, states: npt.NDArray[np.uint8], memory: npt.NDArray[np.float32]
-    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        parts = self._map_shards(partial(self._step, replicas), self._shards(states, memory))
+        """Return the values (B, A) that a recurrent network gives states, and its memory (B, units) after them."""
+        parts = self._map_shards(partial(self._step, replicas or self._online), self._shards(states, memory))
         values, after = zip(*parts, strict=True)
         return np.concatenate(values), np.concatenate(after)
 

@@ -4,14 +4,14 @@ import torch
 from torch import nn
 
 from atlantis_exp.networks.heads import Head
-from atlantis_exp.networks.sizes import check_sides, convolved
+from atlantis_exp.networks.sizes import count_features
 
 
 class DQNCnn(nn.Module):
     """Three convolutions and two dense layers (report figure 2.1; Mnih et al. 2015).
 
     Maps (B, C, H, W) in [0, 1] to the output of `head`, (B, num_actions) by default. The report fixes H = W = 84; here
-    `input_shape` = (C, H, W) sizes the first dense layer. Raises ValueError if a side is below `smallest_side`.
+    `input_shape` = (C, H, W) sizes the first dense layer.
     """
 
     smallest_side = 36  # pixels: 36 -> 8 -> 3 -> 1
@@ -19,10 +19,8 @@ class DQNCnn(nn.Module):
 
     def __init__(self, input_shape: tuple[int, int, int], num_actions: int, head: Head = nn.Linear) -> None:
         super().__init__()
-        channels, height, width = input_shape
-        check_sides(type(self).__name__, self.smallest_side, height, width)
         self.features = nn.Sequential(  # 84x84
-            nn.Conv2d(channels, 32, kernel_size=8, stride=4),  # 20x20
+            nn.Conv2d(input_shape[0], 32, kernel_size=8, stride=4),  # 20x20
             nn.ReLU(),
             nn.Conv2d(32, 64, kernel_size=4, stride=2),  # 9x9
             nn.ReLU(),
@@ -31,7 +29,7 @@ class DQNCnn(nn.Module):
             nn.ReLU(),
         )
         self.fc = nn.Sequential(
-            nn.Linear(64 * _last_side(height) * _last_side(width), 512),
+            nn.Linear(count_features(self.features, input_shape), 512),
             nn.ReLU(),
             head(512, num_actions),
         )
@@ -41,7 +39,3 @@ class DQNCnn(nn.Module):
         x = x.contiguous(memory_format=torch.channels_last)
         q: torch.Tensor = self.fc(self.features(x))
         return q
-
-
-def _last_side(side: int) -> int:
-    return convolved(convolved(convolved(side, kernel=8, stride=4), kernel=4, stride=2), kernel=3, stride=1)

@@ -4,14 +4,14 @@ import torch
 from torch import nn
 
 from atlantis_exp.networks.heads import Head
-from atlantis_exp.networks.sizes import check_sides, convolved
+from atlantis_exp.networks.sizes import count_features
 
 
 class SmallCnn(nn.Module):
     """Two convolutions and one hidden layer (Mnih et al. 2013, section 4.1): three tenths of DQNCnn's FLOPs at 84x84.
 
     Maps (B, C, H, W) in [0, 1] to the output of `head`, (B, num_actions) by default. `input_shape` = (C, H, W) sizes
-    the first dense layer. Raises ValueError if a side is below `smallest_side`.
+    the first dense layer.
     """
 
     smallest_side = 20  # pixels: 20 -> 4 -> 1
@@ -19,16 +19,14 @@ class SmallCnn(nn.Module):
 
     def __init__(self, input_shape: tuple[int, int, int], num_actions: int, head: Head = nn.Linear) -> None:
         super().__init__()
-        channels, height, width = input_shape
-        check_sides(type(self).__name__, self.smallest_side, height, width)
         self.features = nn.Sequential(  # 84x84
-            nn.Conv2d(channels, 16, kernel_size=8, stride=4),  # 20x20
+            nn.Conv2d(input_shape[0], 16, kernel_size=8, stride=4),  # 20x20
             nn.ReLU(),
             nn.Conv2d(16, 32, kernel_size=4, stride=2),  # 9x9
             nn.ReLU(),
         )
         self.fc = nn.Sequential(
-            nn.Linear(32 * _last_side(height) * _last_side(width), 256),
+            nn.Linear(count_features(self.features, input_shape), 256),
             nn.ReLU(),
             head(256, num_actions),
         )
@@ -36,7 +34,3 @@ class SmallCnn(nn.Module):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         q: torch.Tensor = self.fc(self.features(x).flatten(1))
         return q
-
-
-def _last_side(side: int) -> int:
-    return convolved(convolved(side, kernel=8, stride=4), kernel=4, stride=2)

@@ -5,7 +5,7 @@ from torch import nn
 
 from atlantis_exp.networks.dropout import Dropout
 from atlantis_exp.networks.heads import Head
-from atlantis_exp.networks.sizes import check_sides, convolved
+from atlantis_exp.networks.sizes import count_features
 
 
 class ResNetBlock(nn.Module):
@@ -43,17 +43,15 @@ class ResNetDQN(nn.Module):
     """Fourteen convolutions in the main path, four of them the stem, and two dense layers (report figure 2.2).
 
     Maps (B, C, H, W) in [0, 1] to the output of `head`, (B, num_actions) by default. The report fixes H = W = 159; here
-    `input_shape` = (C, H, W) sizes the first dense layer. Raises ValueError if a side is below `smallest_side`.
+    `input_shape` = (C, H, W) sizes the first dense layer.
     """
 
     smallest_side = 15  # pixels: 15 -> 7 -> 5 -> 3 -> 1
 
     def __init__(self, input_shape: tuple[int, int, int], num_actions: int, head: Head = nn.Linear) -> None:
         super().__init__()
-        channels, height, width = input_shape
-        check_sides(type(self).__name__, self.smallest_side, height, width)
         self.block1 = nn.Sequential(  # 159x159
-            nn.Conv2d(channels, 16, kernel_size=3, stride=2),  # 79x79
+            nn.Conv2d(input_shape[0], 16, kernel_size=3, stride=2),  # 79x79
             nn.SiLU(inplace=True),
             nn.BatchNorm2d(16),
             nn.Conv2d(16, 32, kernel_size=3),  # 77x77
@@ -73,7 +71,7 @@ class ResNetDQN(nn.Module):
         )
         self.regression = nn.Sequential(
             Dropout(0.3),
-            nn.Linear(128 * _last_side(height) * _last_side(width), 1024),
+            nn.Linear(count_features(nn.Sequential(self.block1, self.feature_extraction), input_shape), 1024),
             Dropout(0.2),
             nn.SiLU(inplace=True),
             head(1024, num_actions),
@@ -84,9 +82,3 @@ class ResNetDQN(nn.Module):
         x = x.contiguous(memory_format=torch.channels_last)
         q: torch.Tensor = self.regression(self.feature_extraction(self.block1(x)).flatten(1))
         return q
-
-
-def _last_side(side: int) -> int:
-    for stride in (2, 1, 1, 2):
-        side = convolved(side, kernel=3, stride=stride)
-    return -(-side // 4)  # two blocks halve it, rounding up

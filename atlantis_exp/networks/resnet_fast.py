@@ -4,7 +4,7 @@ import torch
 from torch import nn
 
 from atlantis_exp.networks.heads import Head
-from atlantis_exp.networks.sizes import check_sides, convolved
+from atlantis_exp.networks.sizes import count_features
 
 
 class ResidualBlock(nn.Module):
@@ -32,7 +32,7 @@ class ResNetFast(nn.Module):
     statistics and no dropout. It has 3.4 million parameters.
 
     Maps (B, C, H, W) in [0, 1] to the output of `head`, (B, num_actions) by default. It is made for H = W = 159;
-    `input_shape` = (C, H, W) sizes the first dense layer. Raises ValueError if a side is below `smallest_side`.
+    `input_shape` = (C, H, W) sizes the first dense layer.
     """
 
     smallest_side = 8  # pixels: 8 -> 1
@@ -40,10 +40,8 @@ class ResNetFast(nn.Module):
 
     def __init__(self, input_shape: tuple[int, int, int], num_actions: int, head: Head = nn.Linear) -> None:
         super().__init__()
-        channels, height, width = input_shape
-        check_sides(type(self).__name__, self.smallest_side, height, width)
         self.features = nn.Sequential(  # 159x159
-            nn.Conv2d(channels, 16, kernel_size=8, stride=4),  # 38x38
+            nn.Conv2d(input_shape[0], 16, kernel_size=8, stride=4),  # 38x38
             nn.SiLU(),
             nn.Conv2d(16, 32, kernel_size=3, stride=2, padding=1),  # 19x19
             ResidualBlock(32),
@@ -53,7 +51,7 @@ class ResNetFast(nn.Module):
             nn.SiLU(),
         )
         self.fc = nn.Sequential(
-            nn.Linear(64 * _last_side(height) * _last_side(width), 512),
+            nn.Linear(count_features(self.features, input_shape), 512),
             nn.SiLU(),
             head(512, num_actions),
         )
@@ -61,8 +59,3 @@ class ResNetFast(nn.Module):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         q: torch.Tensor = self.fc(self.features(x).flatten(1))
         return q
-
-
-def _last_side(side: int) -> int:
-    side = convolved(side, kernel=8, stride=4)
-    return -(-side // 4)  # two convolutions halve it, rounding up

@@ -1,17 +1,15 @@
-"""Compute sizes: smallest inputs, feature maps, parameters."""
+"""Compute sizes: feature maps, parameters."""
 
+import copy
+
+import torch
 from torch import nn
 
 
-def check_sides(network: str, smallest: int, height: int, width: int) -> None:
-    """Raise ValueError if a side of a network's input is below the smallest, in pixels."""
-    if min(height, width) < smallest:
-        raise ValueError(f"{network} needs at least {smallest} pixels a side, not {height}x{width}")
-
-
-def convolved(side: int, kernel: int, stride: int) -> int:
-    """Return the side of a convolution's feature map from the side of its input, in pixels."""
-    return (side - kernel) // stride + 1
+def count_features(layers: nn.Module, input_shape: tuple[int, int, int]) -> int:
+    """Return how many numbers layers make of an input (C, H, W); change nothing. Raises: RuntimeError if too small."""
+    made: torch.Tensor = copy.deepcopy(layers).to("meta").eval()(torch.empty(1, *input_shape, device="meta"))
+    return made.numel()
 
 
 def count_parameters(network: nn.Module) -> int:

@@ -253,35 +253,25 @@ class ReplayMemory:
             "newest": np.array(list(self._newest.values()), np.int64),
         }
 
-    def load_segments(self, segments: Iterable[dict[str, Any]]) -> None:
+    def load_segments(self, segments: Iterable[dict[str, Any]], lost_until: int | None = None) -> None:
         """Restore the memory that wrote `segments`, oldest first; wholly evicted ones may be missing.
 
-        Eviction depends only on the lengths of the entries, so appending them again gives the same memory.
+        Eviction depends only on the lengths of the entries, so appending them again gives the same memory. Given
+        `lost_until`, earlier segments may be lost, too; without any, the memory continues at that id.
 
         Raises:
             ValueError: a segment is malformed, missing or does not fit; the memory is then unusable.
         """
-        self._clear(0, b"")
+        self._clear(lost_until or 0, b"")
         oldest_id = 0
         for segment in segments:
             self._load_segment(segment)
             oldest_id = segment["oldest_id"]
-        if self.oldest_id != oldest_id:
+        if lost_until is None and self.oldest_id != oldest_id:
             raise ValueError(
                 f"replay segments restore observations since {self.oldest_id:,} instead of {oldest_id:,}: "
                 "a segment is missing, or the memory is smaller than the one that wrote them"
             )
-        self.check_valid()
-
-    def load_newest(self, segments: Iterable[dict[str, Any]], next_id: int) -> None:
-        """Restore the memory that wrote `segments`, without older observations; without any, continue at `next_id`.
-
-        Raises:
-            ValueError: as `load_segments`, but not for missing ones.
-        """
-        self._clear(next_id, b"")
-        for segment in segments:
-            self._load_segment(segment)
         self.check_valid()
 
     def is_under_way(self, env: int) -> bool:

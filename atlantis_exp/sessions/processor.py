@@ -7,13 +7,19 @@ import torch
 
 from atlantis_exp.build import choose_device, choose_shards
 from atlantis_exp.config import Config
-from atlantis_exp.learning.process import OWN_THREADS, set_up_process
+from atlantis_exp.learning.process import OWN_THREADS, keep_freed_memory
 
 
 def set_up_torch(config: Config, device: str) -> None:
-    """Set up torch in this process for a config's network: one thread per shard of a batch, or all for the whole."""
+    """Set up torch in this process for a config's network: threads, determinism, memory.
+
+    A shard of a batch has one thread, a whole batch all of them.
+    """
     shards = choose_shards(config, choose_device(device))
-    set_up_process((config.threads or OWN_THREADS) // shards)
+    torch.set_num_threads((config.threads or OWN_THREADS) // shards)
+    torch.backends.cudnn.deterministic = True  # else some GPU kernels add in any order
+    torch.backends.cudnn.allow_tf32 = False  # fp32 means float32, not TensorFloat-32
+    keep_freed_memory()
 
 
 def processor_name(device: torch.device) -> str:

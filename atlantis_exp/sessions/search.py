@@ -218,10 +218,10 @@ class Trials:
             nonlocal seen, pruned, stopped
             recorder = trainer.recorder
             # By number, not by step: episodes of different trials differ in length.
-            if index == 0 and recorder.evaluations > seen:
-                seen = recorder.evaluations
+            if index == 0 and recorder.done.evaluations > seen:
+                seen = recorder.done.evaluations
                 if seen not in told.intermediate_values:
-                    trial.report(recorder.last_metrics["evaluation/mean"], seen)
+                    trial.report(recorder.done.last_metrics["evaluation/mean"], seen)
                 if pruned := trial.should_prune():
                     where = f"trial {trial.number} of {self.folder.name}, at step {trainer.counters.steps:,}"
                     recorder.tracker.tags({"pruned": where})

@@ -275,7 +275,7 @@ def _faults_recorded(job: Job, folder: RunFolder, journal: Journal) -> Iterator[
 
 def _close(trainer: Trainer, folder: RunFolder, journal: Journal, outcome: Outcome) -> Result:
     """Record how the session ended and, if the run did, its result."""
-    counters, recorder = trainer.counters, trainer.recorder
+    counters, done = trainer.counters, trainer.recorder.done
     counts = {
         "episodes": counters.episodes,
         "frames": counters.frames,
@@ -283,12 +283,12 @@ def _close(trainer: Trainer, folder: RunFolder, journal: Journal, outcome: Outco
         "flops": trainer.learner.updates * trainer.flops_per_update,
         "hours": counters.seconds / 3600,
     }
-    report = recorder.last_report or "no evaluation (evaluation.at_end=false)"
+    report = done.last_report or "no evaluation (evaluation.at_end=false)"
     earlier = None
-    if recorder.last_report and recorder.evaluated_at != counters.steps:
-        earlier = recorder.evaluated_at
+    if done.last_report and done.evaluated_at != counters.steps:
+        earlier = done.evaluated_at
         report = f"evaluated last at step {earlier:,} of {counters.steps:,} (evaluation.at_end=false):\n{report}"
-    result = Result(outcome, counters.steps, counts, recorder.last_metrics, report, earlier)
+    result = Result(outcome, counters.steps, counts, done.last_metrics, report, earlier)
     journal.status("KILLED" if outcome == "interrupted" else "FINISHED")
     if outcome != "interrupted":  # before publishing ends, so that a server gets the result, too
         folder.write_result(result)

@@ -127,11 +127,6 @@ def digest(commit: Commit) -> str:
     return sha256(commit_bytes(commit)).hexdigest()
 
 
-def noted(folder: Path) -> list[Cursor]:
-    """Return a folder's cursors in all stores."""
-    return [cursor for note in folder.glob("published*.json") if (cursor := Cursor.read(note))]
-
-
 def _note(folder: Path, store: Store, is_primary: bool) -> Path:
     """Return the file with a folder's cursor in a store."""
     primary = Cursor.read(folder / PRIMARY)

@@ -16,7 +16,7 @@ from atlantis_exp.runs.folder import RunFolder, all_folders
 from atlantis_exp.runs.journal import Journal, read_commit
 from atlantis_exp.terminal import command_line, quoted
 from atlantis_exp.tracking.local import DATABASE
-from atlantis_exp.tracking.mirror import PRIMARY, Cursor, digest, noted, publish
+from atlantis_exp.tracking.mirror import PRIMARY, Cursor, digest, publish
 from atlantis_exp.tracking.store import Store, first_line
 
 _log = logging.getLogger(__name__)
@@ -161,7 +161,8 @@ def lacking(outputs: Path) -> list[RunFolder]:
     if not (outputs / DATABASE).exists():
         return folders
     store = f"{Store(outputs).uri}#"
-    return [folder for folder in folders if not any(note.store.startswith(store) for note in noted(folder.path))]
+    cursors = {folder: [Cursor.read(note) for note in folder.path.glob("published*.json")] for folder in folders}
+    return [folder for folder in folders if not any(each and each.store.startswith(store) for each in cursors[folder])]
 
 
 def how_to_open(outputs: Path) -> str:

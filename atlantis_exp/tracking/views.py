@@ -140,7 +140,6 @@ def _sweep() -> dict[str, Any]:
     return {
         **_page(SWEEP, charts),
         "groupBy": {"aggregateFunction": "average", "groupByKeys": [{"mode": "tag", "groupByData": "group"}]},
-        "useGroupedValuesInCharts": True,
         "orderByKey": "metrics.`evaluation/interquartile_mean`",
         "searchFilter": "tags.`atlantis.kind` = 'training'",
     }
@@ -150,7 +149,6 @@ def _verdicts() -> dict[str, Any]:
     return {
         **_page(COMPARISONS, []),
         "selectedColumns": ["tags.`verdict`", "attributes.`Created`"],
-        "orderByKey": "attributes.start_time",
         "searchFilter": "tags.`atlantis.kind` = 'comparison'",
     }
 
@@ -166,25 +164,10 @@ def _page(view: str, charts: list[dict[str, Any]]) -> dict[str, Any]:
     charts = [*charts, *({**_images(key), "deleted": True} for key in sorted(covered))]
     return {
         "selectedColumns": list(_COLUMNS),
-        "runsExpanded": {},
-        "runsPinned": [],
-        "runsHidden": [],
         "runsHiddenMode": "FIRST_20_RUNS",
         "compareRunCharts": [{**chart, "uuid": f"{view}-{index}"} for index, chart in enumerate(charts)],
         "compareRunSections": sections,
         "isAccordionReordered": True,
-        "viewMaximized": False,
-        "runListHidden": False,
-        "hideEmptyCharts": True,
-        "autoRefreshEnabled": True,
-        "groupBy": None,
-        "groupsExpanded": {},
-        "globalLineChartConfig": {"xAxisKey": "step", "lineSmoothness": 0, "selectedXAxisMetricKey": ""},
-        "orderByAsc": False,
-        "startTime": "ALL",
-        "lifecycleFilter": "Active",
-        "modelVersionFilter": "All Runs",
-        "datasetsFilter": [],
     }
 
 

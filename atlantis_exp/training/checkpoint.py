@@ -155,7 +155,7 @@ class Checkpoints:
             if isinstance(error, CheckpointError):  # a RuntimeError, too
                 raise
         oldest_id, next_id = int(segments[0]["since"]), int(segments[-1]["next_id"])
-        memory.load_newest(contents, next_id)
+        memory.load_segments(contents, next_id)
         self.lost = memory.oldest_id - max(oldest_id, next_id - memory.capacity)
         return whole
 
@@ -177,13 +177,7 @@ class Checkpoints:
 
     def _write(self, name: str, tree: Mapping[str, Any]) -> dict[str, str]:
         """Write a state tree to files of a new folder; return their checksums."""
-        tensors: dict[str, torch.Tensor] = {}
-        arrays: dict[str, np.ndarray[Any, Any]] = {}
-        files = {"state.json": json.dumps(_disassemble(tree, "", tensors, arrays)).encode()}
-        if tensors:
-            files["tensors.safetensors"] = to_safetensors(tensors)
-        if arrays:
-            files["arrays.safetensors"] = safetensors.numpy.save(arrays)
+        files = files_of(tree)
         for file, content in files.items():
             write_file(self.folder / name / file, content)
         return {file: hashlib.sha256(content).hexdigest() for file, content in files.items()}
@@ -220,6 +214,18 @@ class Checkpoints:
         for path in self.folder.glob("segments/*"):
             if f"segments/{path.name}" not in segments:
                 shutil.rmtree(path, ignore_errors=True)
+
+
+def files_of(tree: Mapping[str, Any]) -> dict[str, bytes]:
+    """Return the files that hold a state tree, by name."""
+    tensors: dict[str, torch.Tensor] = {}
+    arrays: dict[str, np.ndarray[Any, Any]] = {}
+    files = {"state.json": json.dumps(_disassemble(tree, "", tensors, arrays)).encode()}
+    if tensors:
+        files["tensors.safetensors"] = to_safetensors(tensors)
+    if arrays:
+        files["arrays.safetensors"] = safetensors.numpy.save(arrays)
+    return files
 
 
 def _checksum(manifest: Mapping[str, Any]) -> str:

@@ -1,16 +1,13 @@
 """Hash each part of a training, to compare two trainings."""
 
 import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.runs.journal import Image, Metrics, Model, read
+from atlantis_exp.training.checkpoint import files_of
 
 WALL_CLOCK = ("throughput/steps_per_second", "throughput/hours")
 """Metrics that measure the machine, not the training."""
@@ -25,7 +22,8 @@ def fingerprint(state: Mapping[str, Any], memory: ReplayMemory, folder: Path) ->
     parts["learner"] = learner
     parts["replay"] = memory.state_dict()
     parts["history"] = {str(index): event for index, event in enumerate(history(folder))}
-    return {name: _digest(part) for name, part in sorted(parts.items())}
+    files = {name: b"".join(files_of({"part": part}).values()) for name, part in sorted(parts.items())}
+    return {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
 
 
 def history(folder: Path) -> list[dict[str, Any]]:
@@ -38,21 +36,3 @@ def history(folder: Path) -> list[dict[str, Any]]:
             fields["values"] = {name: value for name, value in values.items() if name not in WALL_CLOCK}
             events.append(fields)
     return events
-
-
-def _digest(tree: Any) -> str:
-    hashed = hashlib.sha256()
-
-    def add(node: Any) -> None:
-        if isinstance(node, Mapping):
-            for key, value in node.items():
-                hashed.update(f"{key}:".encode())
-                add(value)
-        elif isinstance(node, torch.Tensor | np.ndarray):
-            array = node.detach().cpu().numpy() if isinstance(node, torch.Tensor) else node
-            hashed.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
-        else:
-            hashed.update(json.dumps(node).encode() + b"\n")
-
-    add(tree)
-    return hashed.hexdigest()

@@ -5,7 +5,7 @@
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -41,18 +41,18 @@ class Played(NamedTuple):
     env: int
 
 
-@dataclass(frozen=True)
-class _Saved:
-    """The evaluations in a recorder's state, for checks on loading."""
+@dataclass
+class Evaluations:
+    """The evaluations of a training so far, as its checkpoints keep them."""
 
-    best_mean: float | None
-    evaluations: Annotated[int, Field(ge=0, lt=2**53)]
-    evaluated_at: Annotated[int, Field(ge=-1, lt=2**53)]
-    owes_evaluation: bool
-    best_step: Annotated[int, Field(ge=-1, lt=2**53)]
-    last_report: str
-    last_metrics: dict[str, int | float]  # ints stay ints: resume is bit for bit
-    best_sha256: str = ""  # missing in 0.1.0
+    best_mean: float | None = None
+    evaluations: Annotated[int, Field(ge=0, lt=2**53)] = 0
+    evaluated_at: Annotated[int, Field(ge=-1, lt=2**53)] = -1  # step, as it was written down
+    owes_evaluation: bool = False  # of this step: it was stopped; resume repeats it
+    best_step: Annotated[int, Field(ge=-1, lt=2**53)] = -1
+    best_sha256: str = ""  # of the weights evaluated there, as a file; missing in 0.1.0
+    last_report: str = ""
+    last_metrics: dict[str, int | float] = field(default_factory=dict)  # ints stay ints: resume is bit for bit
 
 
 class Diverged(Fault):
@@ -76,14 +76,7 @@ class Recorder:
 
     def __post_init__(self) -> None:
         self.episodes: list[Played] = []
-        self.best_mean = -np.inf  # of all evaluations
-        self.best_step = -1
-        self.best_sha256 = ""  # of the weights evaluated there, as a file
-        self.evaluations = 0
-        self.evaluated_at = -1  # step, as it was written down
-        self.evaluation_pending = False  # of this step: it was stopped; resume repeats it
-        self.last_report = ""  # of the latest evaluation
-        self.last_metrics: dict[str, float] = {}  # of the latest evaluation
+        self.done = Evaluations()
         self._pace = Pace()
         self._last_step: int | None = None
 
@@ -163,7 +156,7 @@ class Recorder:
 
     def evaluate(self, counters: Counters, num_envs: int, has_ended: bool, stop: Stop) -> None:
         """Evaluate this step's network and keep its weights; pending if stopped. Raises: Diverged."""
-        step = counters.steps
+        step, done = counters.steps, self.done
         if (every := self.cadence.evaluate_steps) and not has_ended:
             # It belongs to the step at which it was due, as with the curves; the last one to the run's last step, where
             # comparisons look for it.
@@ -171,25 +164,25 @@ class Recorder:
             step = due if step - due < num_envs else step
         episodes = self.cadence.final_episodes if has_ended else self.cadence.interim_episodes
         # A run that continues from an evaluation may end there, and then owes a longer one.
-        if step == self.evaluated_at and self.last_metrics["evaluation/episodes"] >= episodes:
+        if step == done.evaluated_at and done.last_metrics["evaluation/episodes"] >= episodes:
             return
         self.refuse_divergence()
-        self.evaluation_pending = True
+        done.owes_evaluation = True
         try:
             with self._pace.paused():
                 evaluation = self.play(episodes, self.progress, stop)
-                is_best = evaluation.summary.mean > self.best_mean
+                is_best = done.best_mean is None or evaluation.summary.mean > done.best_mean
                 video = self.film(evaluation, self.progress, stop) if is_best else None
         except Stopped:
             return
-        self.evaluation_pending = False
+        done.owes_evaluation = False
         metrics = evaluation.metrics()
         self.tracker.metrics(metrics, step)
         self.tracker.tags({"policy": evaluation.policy})
         scores = [episode.score for episode in evaluation.episodes]
         title = f"evaluation, step {step:,}"
-        self.tracker.image("evaluation/histogram", score_histogram(scores, title, self.score_range), self.evaluations)
-        self.evaluations += 1
+        self.tracker.image("evaluation/histogram", score_histogram(scores, title, self.score_range), done.evaluations)
+        done.evaluations += 1
         table = evaluation_at(step)
         self.tracker.artifact(table, evaluation.table().to_csv().encode())
         self.tracker.artifact(table.replace(".csv", ".txt"), evaluation.report().encode())
@@ -197,13 +190,12 @@ class Recorder:
         results = {name: value for name, value in metrics.items() if name.startswith("evaluation/")}
         self.tracker.model(NETWORK, weights, step, results, best=is_best)
         if is_best:
-            self.best_mean, self.best_step = evaluation.summary.mean, step
-            self.best_sha256 = hashlib.sha256(weights).hexdigest()
+            done.best_mean, done.best_step = evaluation.summary.mean, step
+            done.best_sha256 = hashlib.sha256(weights).hexdigest()
             self.tracker.tags({"best_evaluation": f"mean {evaluation.summary.mean:,.0f} at step {step}"})
             if video is not None:
                 self.tracker.artifact(BEST_EPISODE, video)
-        self.evaluated_at, self.last_report = step, evaluation.report()
-        self.last_metrics = metrics
+        done.evaluated_at, done.last_report, done.last_metrics = step, evaluation.report(), metrics
         self._write_episodes()
         self._describe("running", counters)
         self.progress.evaluated(step, counters.frames, evaluation)
@@ -214,14 +206,7 @@ class Recorder:
     def state_dict(self) -> dict[str, Any]:
         return {
             "episodes": np.array(self.episodes).reshape(-1, len(Played._fields)),
-            "best_mean": None if np.isinf(self.best_mean) else self.best_mean,
-            "evaluations": self.evaluations,
-            "evaluated_at": self.evaluated_at,
-            "owes_evaluation": self.evaluation_pending,
-            "best_step": self.best_step,
-            "best_sha256": self.best_sha256,
-            "last_report": self.last_report,
-            "last_metrics": self.last_metrics,
+            **asdict(self.done),
             "tracker": self.tracker.state_dict(),
         }
 
@@ -230,13 +215,8 @@ class Recorder:
             self.episodes.append(Played(int(episode), int(step), int(frames), score, int(length), int(env)))
         if not np.isfinite(self.recent_scores(len(self.episodes))).all():
             raise ValueError("the scores are not finite")
-        saved = checked(_Saved, state)
-        self.best_mean = -np.inf if saved.best_mean is None else saved.best_mean
-        self.evaluations, self.evaluated_at = saved.evaluations, saved.evaluated_at
-        self.evaluation_pending, self.best_step = saved.owes_evaluation, saved.best_step
-        self.best_sha256 = saved.best_sha256
-        self.last_report, self.last_metrics = saved.last_report, saved.last_metrics
-        if self.last_metrics and (missing := EVALUATED - self.last_metrics.keys()):
+        self.done = checked(Evaluations, state)
+        if self.done.last_metrics and (missing := EVALUATED - self.done.last_metrics.keys()):
             raise ValueError(f"the last evaluation lacks {min(missing)}")
         self.tracker.load_state_dict(state["tracker"])
 
@@ -246,7 +226,7 @@ class Recorder:
 
     def _describe(self, state: str, counters: Counters) -> None:
         """Describe the run's state, progress and result in markdown."""
-        reached = self.last_metrics
+        done, reached = self.done, self.done.last_metrics
         lines = [  # the result first: MLflow shows five lines and folds the rest
             f"**{state}** at step {counters.steps:,}: {counters.episodes:,} episodes, {counters.frames:,} frames, "
             f"{self.learner.updates:,} updates, {counters.seconds / 3600:.2f} hours",
@@ -256,9 +236,9 @@ class Recorder:
         if reached:
             scores = " | ".join(f"{reached[f'evaluation/{point}']:,.0f}" for point in TABLE_COLUMNS)
             lines += [
-                f"The best mean so far is {self.best_mean:,.0f}, at step {self.best_step:,}.",
+                f"The best mean so far is {done.best_mean:,.0f}, at step {done.best_step:,}.",
                 "| evaluated at step | mean | +- | median | IQM | high | low | epsilon | episodes | random |\n"
-                f"|{' ---: |' * 10}\n| {self.evaluated_at:,} | {scores} | {reached['evaluation/epsilon']} | "
+                f"|{' ---: |' * 10}\n| {done.evaluated_at:,} | {scores} | {reached['evaluation/epsilon']} | "
                 f"{reached['evaluation/episodes']:.0f} | {reached['actions/random_share']:.1%} |",
             ]
         self.tracker.note("\n\n".join([*lines, self.about]))

@@ -160,7 +160,7 @@ class Trainer:
         self._session_start = time.monotonic() - self.counters.seconds
         self._last_commit = time.monotonic()
         self.recorder.begin(self.counters, self.last_step)
-        if self.recorder.evaluation_pending:
+        if self.recorder.done.owes_evaluation:
             self._evaluate(stop)
 
     def _begin_episodes(self, envs: Sequence[int], seeds: Sequence[int] | None = None) -> None:
@@ -233,7 +233,7 @@ class Trainer:
         if self.has_ended and self.recorder.cadence.evaluate_at_end:
             self._evaluate(stop)
         outcome: Outcome = "finished" if self.plan.done(self.counters) >= self.plan.length else "budget"
-        if not self.has_ended or self.recorder.evaluation_pending:
+        if not self.has_ended or self.recorder.done.owes_evaluation:
             outcome = "interrupted"
         self._take_time()
         self.recorder.end(self.counters, outcome)

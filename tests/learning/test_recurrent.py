@@ -124,14 +124,14 @@ def test_acting_step_by_step_is_the_sequence_and_the_average_acts_by_its_own_wei
 
 
 def test_flops_count_every_state_of_a_sequence_once_a_pass() -> None:
+    learner = _learner(DQN())
     with FlopCounterMode(display=False) as counter:
-        _learner(DQN()).update(*_batch())
+        learner.update(*_batch())
     flops = counter.get_total_flops()
     assert _learner(DQN()).update_flops((2, SIDE, SIDE), 5) == flops
+    network = cast(DQNCnnGru, _learner().network)
     with FlopCounterMode(display=False) as counter, torch.no_grad():  # of the choice of Double DQN, after the burn-in
-        cast(DQNCnnGru, _learner().network).sequence(
-            torch.zeros(5, UNROLL + AHEAD, 2, SIDE, SIDE), torch.zeros(5, 8), torch.zeros(5)
-        )
+        network.sequence(torch.zeros(5, UNROLL + AHEAD, 2, SIDE, SIDE), torch.zeros(5, 8), torch.zeros(5))
     assert _learner(DoubleDQN()).update_flops((2, SIDE, SIDE), 5) == flops + counter.get_total_flops()
     assert _learner(DQN(), burn_in=2 * UNROLL).update_flops((2, SIDE, SIDE), 5) > flops
 

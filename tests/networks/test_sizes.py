@@ -1,16 +1,20 @@
 import torch
-from hypothesis import assume, given
-from hypothesis import strategies as st
 from torch import nn
 
-from atlantis_exp.networks.sizes import convolved, count_parameters
+from atlantis_exp.networks.sizes import count_features, count_parameters
 
 
-@given(side=st.integers(1, 24), kernel=st.integers(1, 8), stride=st.integers(1, 4))
-def test_the_side_after_a_convolution_is_the_one_torch_makes(side: int, kernel: int, stride: int) -> None:
-    assume(kernel <= side)
-    made = nn.Conv2d(1, 1, kernel, stride)(torch.zeros(1, 1, side, side))
-    assert convolved(side, kernel, stride) == made.shape[2]
+def test_features_are_counted_without_a_trace_in_the_layers_or_in_random_numbers() -> None:
+    layers = nn.Sequential(nn.Conv2d(2, 3, 3, stride=2), nn.BatchNorm2d(3), nn.ReLU(inplace=True)).train()
+    before = {name: value.clone() for name, value in layers.state_dict().items()}
+    chance = torch.get_rng_state()
+    assert count_features(layers, (2, 11, 8)) == layers(torch.zeros(1, 2, 11, 8)).numel() == 3 * 5 * 3
+    assert torch.equal(torch.get_rng_state(), chance)
+    layers.load_state_dict(before)
+    count_features(layers, (2, 11, 8))
+    assert layers.training
+    for name, value in layers.state_dict().items():
+        assert torch.equal(value, before[name])
 
 
 def test_running_statistics_are_no_parameters() -> None:

@@ -424,12 +424,12 @@ def test_the_newest_segments_alone_are_the_memory_without_what_came_before() -> 
     written = memory.next_id
     played(memory, 20)
     rest = played(memory_of(100), 10)  # to be forgotten
-    rest.load_newest([memory.segment(written)], memory.next_id)
+    rest.load_segments([memory.segment(written)], memory.next_id)
     assert (rest.oldest_id, rest.next_id) == (written, memory.next_id)
     assert [env for env in range(5) if rest.is_under_way(env)] == [0, 1, 2, 3]
     ids = available_ids(rest)
     assert_same_transitions(rest.gather(ids, ONE_STEP), memory.gather(ids, ONE_STEP))
-    rest.load_newest([], 77)
+    rest.load_segments([], 77)
     assert (len(rest), rest.oldest_id, rest.next_id, rest.is_under_way(0)) == (0, 77, 77, False)
     rest.load_segments([])
     assert (len(rest), rest.next_id) == (0, 0)
@@ -537,4 +537,4 @@ def test_a_newest_segment_whose_links_contradict_each_other_is_refused() -> None
     forged = played(memory, 20).segment(written)
     forged["back"] = np.full_like(forged["back"], 1)  # four environments, all of one line
     with pytest.raises(ValueError, match="has no successor"):
-        memory_of(100).load_newest([forged], memory.next_id)
+        memory_of(100).load_segments([forged], memory.next_id)

@@ -111,11 +111,11 @@ def test_the_description_says_how_the_run_stands_and_what_its_last_evaluation_wa
     assert all(note.endswith("\n\nContinue with: x") for note in notes())
     assert "**interrupted** at step 100" in notes()[-1]
     trainer.run()
-    recorder = trainer.recorder
-    mean = recorder.last_metrics["evaluation/mean"]
+    done = trainer.recorder.done
+    mean = done.last_metrics["evaluation/mean"]
     assert "**finished** at step 160" in notes()[-1]
     assert f"| 160 | {mean:,.0f} |" in notes()[-1]
-    assert f"The best mean so far is {recorder.best_mean:,.0f}, at step {recorder.best_step:,}." in notes()[-1]
+    assert f"The best mean so far is {done.best_mean:,.0f}, at step {done.best_step:,}." in notes()[-1]
 
 
 @pytest.mark.parametrize(("episode_steps", "short"), [(200, True), (100, True), (80, False)])  # of 160 steps
@@ -206,5 +206,6 @@ def test_a_recorder_continues_where_another_stood(small: Small, tmp_path: Path) 
     assert state == loaded
     assert other.episodes == trainer.recorder.episodes != []
     assert all(isinstance(played, Played) and isinstance(played.step, int) for played in other.episodes)
-    assert other.best_mean == trainer.recorder.best_mean > -np.inf
+    assert other.done == trainer.recorder.done
+    assert other.done.best_mean is not None
     assert small(tmp_path / "fresh").recorder.state_dict()["best_mean"] is None

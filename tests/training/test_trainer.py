@@ -405,15 +405,15 @@ def test_a_network_that_has_diverged_is_not_evaluated(small: Small, tmp_path: Pa
     next(trainer.learner.network.parameters()).data[:] = np.nan
     with pytest.raises(Diverged):
         trainer.run()
-    assert (trainer.counters.steps, trainer.recorder.evaluations) == (80, 0)
+    assert (trainer.counters.steps, trainer.recorder.done.evaluations) == (80, 0)
 
 
 def test_a_run_that_ends_where_it_was_evaluated_in_passing_is_evaluated_in_full(small: Small, tmp_path: Path) -> None:
     trainer = small(tmp_path, interim_episodes=1)
-    assert trainer.run(lambda: trainer.recorder.evaluations == 1) == "interrupted"
+    assert trainer.run(lambda: trainer.recorder.done.evaluations == 1) == "interrupted"
     ended = small(tmp_path, interim_episodes=1, max_steps=80)
     assert ended.run() == "budget"
-    assert ended.recorder.last_metrics["evaluation/episodes"] == 2
+    assert ended.recorder.done.last_metrics["evaluation/episodes"] == 2
     assert small(tmp_path, interim_episodes=1, max_steps=80).run() == "budget"
     assert curve(tmp_path, "evaluation/episodes") == [(80, 1), (80, 2)]
 
@@ -428,7 +428,7 @@ def test_a_training_ends_at_the_first_step_at_which_its_updates_are_made_and_is_
     assert unbroken.run(lambda: before.setdefault(unbroken.counters.steps, unbroken.learner.updates) < 0) == "budget"
     assert before.pop(unbroken.counters.steps, 11) == 11 == unbroken.learner.updates
     assert max(before.values()) == 10
-    assert unbroken.recorder.evaluated_at == unbroken.counters.steps
+    assert unbroken.recorder.done.evaluated_at == unbroken.counters.steps
     assert unbroken.last_step is not None
     assert abs(unbroken.last_step - unbroken.counters.steps) <= 2 * max(num_envs, 4)
 
@@ -453,7 +453,7 @@ def test_an_evaluation_that_is_asked_to_stop_is_made_good(small: Small, tmp_path
     stopped = small(tmp_path / "broken", phases=phases(120))
     asked = after(30)
     assert stopped.run(lambda: stopped.counters.steps == step and asked()) == "interrupted"
-    assert (stopped.counters.steps, stopped.recorder.evaluation_pending) == (step, True)
+    assert (stopped.counters.steps, stopped.recorder.done.owes_evaluation) == (step, True)
     assert step not in dict(curve(tmp_path / "broken", "evaluation/mean"))
     continued = small(tmp_path / "broken", phases=phases(120))
     assert continued.run() == "finished"
