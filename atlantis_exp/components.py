@@ -183,6 +183,7 @@ def built_in() -> Mapping[tuple[str, str], Component]:
     ours = [
         _ours("model", "cnn", "networks.cnn.DQNCnn", smallest_side=36, splits_batches=True),
         _ours("model", "cnn_gru", "networks.cnn_gru.DQNCnnGru", smallest_side=36, splits_batches=True, **sequences),
+        _ours("model", "cnn_norm", "networks.cnn_norm.NormedCnn", smallest_side=36, splits_batches=True),
         _ours("model", "cnn_small", "networks.cnn_small.SmallCnn", smallest_side=20, splits_batches=True),
         _ours("model", "resnet", "networks.resnet.ResNetDQN", smallest_side=15),
         _ours("model", "resnet_fast", "networks.resnet_fast.ResNetFast", smallest_side=8, splits_batches=True),

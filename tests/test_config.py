@@ -113,7 +113,7 @@ def another(key: str, value: Any) -> Any:
         "env.crop": ([0, 160, 210, 0], [16, 160, 96, 0]),
         "env.frameskip": (4, 3),
         "optimizer.betas": ([0.9, 0.999], [0.8, 0.9]),
-        "model.name": ("cnn", "cnn_small", "resnet", "resnet_fast"),
+        "model.name": ("cnn", "cnn_norm", "cnn_small", "resnet", "resnet_fast"),
         "resume": ("auto", "never"),
         "device": ("auto", "cpu"),
         "tracking.name": ("mlflow", "none"),

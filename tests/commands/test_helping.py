@@ -48,7 +48,9 @@ def test_a_preset_and_a_chosen_option_show_their_keys() -> None:
     assert "epsilon.duration" not in shown_keys("train")
     assert "epsilon.decay" not in shown_keys("train")
     assert "epsilon.decay" in shown_keys("train", "all")
-    assert "model=nothing   (cnn, cnn_gru, cnn_small, resnet, resnet_fast)" in help_text("train", ["model=nothing"])
+    assert "model=nothing   (cnn, cnn_gru, cnn_norm, cnn_small, resnet, resnet_fast)" in help_text(
+        "train", ["model=nothing"]
+    )
     assert f"model={300 * 'a'}   (cnn, " in help_text("train", [f"model={300 * 'a'}"])  # too long for a file's name
 
 

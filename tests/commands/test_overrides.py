@@ -73,7 +73,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("experiment=quik", "experiment=quik", "'quick'"),
     ("phase={}", "phase={}", "quick, single, steps, two_phase"),
     ("env=3", "env=3", "atlantis_v0"),
-    ("model=null", "model=None", "cnn, cnn_gru, cnn_small, resnet, resnet_fast"),
+    ("model=null", "model=None", "cnn, cnn_gru, cnn_norm, cnn_small, resnet, resnet_fast"),
     ("objective.name=double", "objective.name=double", "'double_dqn'"),
     ("env.id=Pong-v0", "env.id=Pong-v0", "ALE/Atlantis-v5, Atlantis-v0"),
     ("resume=maybe", "resume=maybe", "auto, must, never"),

@@ -287,7 +287,7 @@ def test_why_a_network_cannot_be_onnx_is_said_whole_and_without_colours(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["cnn", "resnet", "resnet_fast", "cnn_small"])
+@pytest.mark.parametrize("model", ["cnn", "cnn_norm", "resnet", "resnet_fast", "cnn_small"])
 def test_a_network_as_onnx_says_what_it_says_in_torch(
     command: Command, tiny: Compose, tmp_path: Path, capsys: pytest.CaptureFixture[str], model: str
 ) -> None:
