@@ -87,7 +87,6 @@ def test_updates_of_a_memory_are_the_processor_s_and_never_wait(
 ) -> None:
     words = (
         "model=cnn_gru",
-        "model=cnn_norm",
         "model.units=8",
         "model.burn_in=2",
         "model.unroll=4",
