@@ -89,7 +89,7 @@ def command_line(*arguments: str) -> str:
 def quoted(value: object) -> str:
     """Return the text of a value, quoted for Hydra if needed."""
     text = str(value)
-    if re.fullmatch(r"(?!(null|true|false|nan|inf)$)[a-z_/][\w/.+:%@-]*", text, re.ASCII | re.IGNORECASE):
+    if re.fullmatch(r"(?!(null|true|false|nan|inf)$)([a-z_]|\.{0,2}/)[\w/.+:%@-]*", text, re.ASCII | re.IGNORECASE):
         return text
     return '"' + re.sub(r'(\\*)("|$)', lambda match: match[1] * 2 + match[2].replace('"', r"\""), text) + '"'
 

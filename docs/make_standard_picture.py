@@ -16,7 +16,7 @@ from tables import arguments
 from atlantis_exp.comparison.figures import thousands
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.components import game_of
-from atlantis_exp.media import BLUE, GREY
+from atlantis_exp.media import BLUE, GREEN, GREY
 
 PUBLISHED = {"DreamerV3": "s", "QR-DQN Impala ResNet": "^", "QR-DQN Nature CNN": "v"}
 SEEDS = (("-", "o"), ("--", "X"), (":", "D"))  # line of training, mark of evaluations
@@ -34,12 +34,14 @@ def main(name: str, outputs: Sequence[Path]) -> None:
     figure = Figure(figsize=(7, 4.5), dpi=100, layout="constrained")
     axes = figure.subplots()
     for run, points in groupby(rows, key=lambda row: row["run"]):
-        training, seed = list(points), int(run.split("-")[2].removeprefix("s"))
+        training, (network, _, seed, _) = list(points), run.split("-")
         evaluated = [row for row in training if row["evaluation"]]
-        line, mark = SEEDS[seed]
-        axes.plot(*columns(training, "step", "mean_20", 1e6 / FRAMES), color=BLUE, linestyle=line, linewidth=1)
-        axes.plot(*columns(evaluated, "step", "evaluation", 1e6 / FRAMES), mark, color=BLUE)
-        axes.plot([], [], color=BLUE, linestyle=line, marker=mark, linewidth=1, label=f"{TRAINED[name]}, seed {seed}")
+        line, mark = SEEDS[int(seed.removeprefix("s"))]
+        colour, what = (GREEN, "layer normalization, too") if network == "cnn_norm" else (BLUE, TRAINED[name])
+        axes.plot(*columns(training, "step", "mean_20", 1e6 / FRAMES), color=colour, linestyle=line, linewidth=1)
+        axes.plot(*columns(evaluated, "step", "evaluation", 1e6 / FRAMES), mark, color=colour)
+        label = f"{what}, seed {seed.removeprefix('s')}"
+        axes.plot([], [], color=colour, linestyle=line, marker=mark, linewidth=1, label=label)
     last = max(FRAMES * int(row["step"]) for row in rows) / 1e6
     for agent, mark in PUBLISHED.items():
         known = [row for row in curves(game_of("Atlantis-v0")) if row["name"] == agent]

@@ -55,6 +55,11 @@ def in_the_fields_game() -> list[EpisodeTable]:
     return [games_at(first), EpisodeTable.read(RESULTS / "standard" / "seed_1.csv", SOURCES), games_at(third)]
 
 
+def with_layer_normalization() -> list[EpisodeTable]:
+    """Return the games of three trainings with layer normalization, by seed."""
+    return [EpisodeTable.read(RESULTS / "rewards" / f"normed_{seed}.csv", SOURCES) for seed in range(3)]
+
+
 def to_a_power(question: str) -> list[RunFolder]:
     """Return the trainings in the field's game with rewards to a power and states of four frames, by seed."""
     configs = [(run, run.trained_config) for run in KEPT[question]]
@@ -253,6 +258,9 @@ def of_rewards() -> Iterator[tuple[str, str]]:
     played = [games_at(run) for run in runs]
     means, scores = [games.scores.mean() for games in played], np.concatenate([games.scores for games in played])
     yield from ((LAB, text) for text in whole((*means, np.mean(means), np.ptp(means), min(scores), max(scores))))
+    with (DATA / "rewards.csv").open() as file:
+        evaluated = [int(row["evaluation"]) for row in csv.DictReader(file) if row["evaluation"]]
+    yield from ((LAB, text) for text in whole(evaluated))
     for run in (*runs, longer):
         yield LAB, f"{60 * metrics_of(run, 'throughput/hours')[-1]:.0f}"
         yield (
@@ -349,12 +357,14 @@ def tables() -> dict[str, str]:
             seeds = [interquartile_mean(games_at(run).scores) for run in of_the_verdict(model, sampler).values()]
             shown = " | ".join(whole((np.mean(seeds), min(seeds), max(seeds))))
             answers.append(f"| {network}, `sampler={sampler}` | {len(seeds)} | {shown} |")
-    field = ["| rewards | seed 0 | seed 1 | seed 2 |", "| --- | ---: | ---: | ---: |"]
+    field = ["| training | seed 0 | seed 1 | seed 2 |", "| --- | ---: | ---: | ---: |"]
     clipped = [games.scores.mean() for games in in_the_fields_game()]
     runs = [run for run in to_a_power("rewards") if run.trained_config.objective.gamma == 0.99]
     powered = [games_at(run).scores.mean() for run in runs]
-    for rewards, means in (("at most 1", clipped), ("to the power of .25", powered)):
-        field.append(f"| {rewards} | {' | '.join(whole(means))} |")
+    normed = [games.scores.mean() for games in with_layer_normalization()]
+    names = "rewards of at most 1", "rewards to the power of .25", "the same, with `model=cnn_norm`"
+    for name, means in zip(names, (clipped, powered, normed), strict=True):
+        field.append(f"| {name} | {' | '.join(whole(means))} |")
     players = ["| player | network | mean | games | game |", "| --- | --- | ---: | ---: | --- |"]
     for path in sorted(PRETRAINED.glob("*/card.json")):
         card, _ = read_card(path.parent)

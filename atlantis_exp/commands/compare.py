@@ -91,11 +91,11 @@ def named(columns: Iterable[str]) -> dict[str, str]:
     return names
 
 
-def list_out(arguments: Iterable[str]) -> list[str]:
+def list_out(arguments: Iterable[str], keys: str = "by|columns|runs|where") -> list[str]:
     """Allow lists without brackets, as in `by=model,sampler`, and quote the baseline."""
     # Hydra would read the commas as a sweep, a second `=` as a mistake, some commits as numbers; it refuses `lr=0.001`.
     quoted = (re.sub(r"^baseline=(?!null$)([^'\"]+)$", r"baseline='\1'", argument) for argument in arguments)
-    return [re.sub(r"^(against|by|columns|runs|where)=([^\[].*)$", listed, argument) for argument in quoted]
+    return [re.sub(rf"^({keys})=([^\[].*)$", listed, argument) for argument in quoted]
 
 
 def listed(match: re.Match[str]) -> str:

@@ -39,7 +39,7 @@ def complete(flag: str, words: Sequence[str]) -> str:
     if flag == "--complete":
         return "\n".join(candidates(words))
     if (shell := "".join(words)) not in SCRIPTS:
-        raise ConfigError(f"--completion: {shell}: no such shell; {nearest(shell, SCRIPTS)}")
+        raise ConfigError(f"--completion={shell}: no such shell; {nearest(shell, SCRIPTS)}")
     return SCRIPTS[shell]
 
 

@@ -55,7 +55,7 @@ def _launchers(texts: Iterable[str]) -> list[str]:
 
 def _first_contender(arguments: list[str]) -> list[str]:
     """Return the arguments of the first contender, without a launcher: its config has the keys that all share."""
-    flags = flags_of(arguments := list_out(arguments))
+    flags = flags_of(arguments := list_out(arguments, "against"))
     if flags.multirun:
         raise ConfigError("-m: decide plans its own sweeps; drop -m")
     refuse_twice(arguments)
@@ -81,7 +81,7 @@ def contest_of(asked: Asked[DecideConfig]) -> "Contest":
     """Return the contest that was asked for. Raises: ConfigError if it cannot be decided."""
     from atlantis_exp.sessions.deciding import Contest
 
-    config, typed = asked.config, list_out(asked.typed)
+    config, typed = asked.config, list_out(asked.typed, "against")
     several = swept(typed)
     if several and config.against:
         raise ConfigError(f"{several[0]}: write several values or against=, not both")

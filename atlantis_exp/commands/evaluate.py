@@ -1,9 +1,9 @@
 """`python -m atlantis_exp evaluate run=NAME epsilon=0.05`: play a stored run's network, or an exported one."""
 
-import os
 import re
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 from pydantic.dataclasses import dataclass
 
@@ -25,7 +25,7 @@ class EvaluateConfig:
     paths: PathsConfig
 
     def __post_init__(self) -> None:
-        is_folder = "/" in self.weights or os.path.exists(f"{self.weights}/card.json")
+        is_folder = "/" in self.weights or Path(self.weights, "card.json").exists()
         if self.weights not in ("latest", "best") and not is_folder:
             hint = nearest(self.weights, ("latest", "best"))
             raise ConfigError(f"weights={self.weights}: not a folder such as pretrained/NAME; {hint}")

@@ -80,10 +80,10 @@ _TITLE = {
 """The titles of columns, in one table or in all, that differ from their names."""
 
 SHARES = {
-    *("time_cap_share", "truncated_share", "random_share", "share", "probability", "network", "random"),
+    *("time_cap_share", "truncated_share", "random_share", "share", "network", "random"),
     *("human_normalised_mean", "error", "spent"),
 }
-"""The columns with shares and probabilities, from 0 to 1."""
+"""The columns with shares, from 0 to 1."""
 _ENDS = {
     ("scores", "score"): ("low", "high"),
     ("scores", "difference"): ("difference_low", "difference_high"),

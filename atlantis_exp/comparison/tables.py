@@ -271,8 +271,9 @@ def _runs(groups: Groups) -> Table:
                 "seed": training.config["seed"],
                 **{axis: training.curve[axis][-1] if axis in training.curve else "" for axis in AXES},
                 "epsilon": training.config["evaluation.epsilon"],
+                "episodes": summary.episodes,
                 "score": training.score,
-                **{key: getattr(summary, key) for key in ("episodes", "mean", "median", "low", "high")},
+                **{key: getattr(summary, key) for key in ("mean", "median", "low", "high")},
                 "policy": training.policy,
                 "same_as": same_as if same_as != training.name else "",
             }

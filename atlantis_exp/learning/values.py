@@ -53,17 +53,16 @@ def channels_last(states: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 class Replicas:
     """Copies of a network, one a thread, that share buffers, generators and weights in the precision of the pass.
 
-    In bfloat16 only layers with matrices are cast; normalisation stays float32. `refresh` them after an update.
+    In bfloat16 batch normalization stays float32. `refresh` them after an update.
     """
 
     def __init__(self, network: nn.Module, dtype: torch.dtype, count: int) -> None:
-        with_matrices = [
+        self._masters: list[torch.Tensor] = [
             parameter
             for module in network.modules()
-            if any(parameter.ndim > 1 for parameter in module.parameters(recurse=False))
+            if dtype is torch.bfloat16 and not isinstance(module, nn.modules.batchnorm._NormBase)
             for parameter in module.parameters(recurse=False)
         ]
-        self._masters: list[torch.Tensor] = [*with_matrices] if dtype is torch.bfloat16 else []
         self._casts = [parameter.detach().to(dtype) for parameter in self._masters]
         if not self._casts and count == 1:
             self.networks = [network]
@@ -101,7 +100,7 @@ class ActionValues:
         self._online = Replicas(network, self.dtype, shards)
 
     def q_values(self, states: npt.NDArray[np.uint8], replicas: Replicas | None = None) -> npt.NDArray[np.float32]:
-        """Return the values (B, A) that the network, or its replicas, give states (B, C, H, W) in 0..255."""
+        """Return the values (B, A) that the network, or one with `replicas`, gives states (B, C, H, W) in 0..255."""
         return np.concatenate(self._map_shards(partial(self._values, replicas or self._online), self._shards(states)))
 
     @torch.inference_mode()

@@ -1,10 +1,10 @@
 """The network of the DQN paper with layer normalization."""
 
-import torch
 from torch import nn
 
 from atlantis_exp.networks.cnn import DQNCnn
 from atlantis_exp.networks.heads import Head
+from atlantis_exp.networks.sizes import shapes_of
 
 
 class NormedCnn(DQNCnn):
@@ -15,10 +15,7 @@ class NormedCnn(DQNCnn):
 
     def __init__(self, input_shape: tuple[int, int, int], num_actions: int, head: Head = nn.Linear) -> None:
         super().__init__(input_shape, num_actions, head)
-        x, layers = torch.zeros(1, *input_shape), list[nn.Module]()
-        for layer in (*self.features, *self.fc):
-            if isinstance(layer, nn.ReLU):
-                layers.append(nn.LayerNorm(x.shape[1:]))
-            layers.append(layer)
-            x = layer(x)
+        plain, layers = (*self.features, *self.fc), list[nn.Module]()
+        for layer, shape in zip(plain, shapes_of(plain, input_shape), strict=True):
+            layers += [nn.LayerNorm(shape), layer] if isinstance(layer, nn.ReLU) else [layer]
         self.features, self.fc = nn.Sequential(*layers[:10]), nn.Sequential(*layers[10:])

@@ -4,7 +4,7 @@ import torch
 from torch import nn
 
 from atlantis_exp.networks.heads import Head
-from atlantis_exp.networks.sizes import count_features
+from atlantis_exp.networks.sizes import shapes_of
 
 
 class SmallCnn(nn.Module):
@@ -26,7 +26,7 @@ class SmallCnn(nn.Module):
             nn.ReLU(),
         )
         self.fc = nn.Sequential(
-            nn.Linear(count_features(self.features, input_shape), 256),
+            nn.Linear(shapes_of(self.features, input_shape)[-1].numel(), 256),
             nn.ReLU(),
             head(256, num_actions),
         )

@@ -5,7 +5,7 @@ from torch import nn
 
 from atlantis_exp.networks.dropout import Dropout
 from atlantis_exp.networks.heads import Head
-from atlantis_exp.networks.sizes import count_features
+from atlantis_exp.networks.sizes import shapes_of
 
 
 class ResNetBlock(nn.Module):
@@ -71,7 +71,7 @@ class ResNetDQN(nn.Module):
         )
         self.regression = nn.Sequential(
             Dropout(0.3),
-            nn.Linear(count_features(nn.Sequential(self.block1, self.feature_extraction), input_shape), 1024),
+            nn.Linear(shapes_of((*self.block1, *self.feature_extraction), input_shape)[-1].numel(), 1024),
             Dropout(0.2),
             nn.SiLU(inplace=True),
             head(1024, num_actions),

@@ -4,7 +4,7 @@ import torch
 from torch import nn
 
 from atlantis_exp.networks.heads import Head
-from atlantis_exp.networks.sizes import count_features
+from atlantis_exp.networks.sizes import shapes_of
 
 
 class ResidualBlock(nn.Module):
@@ -51,7 +51,7 @@ class ResNetFast(nn.Module):
             nn.SiLU(),
         )
         self.fc = nn.Sequential(
-            nn.Linear(count_features(self.features, input_shape), 512),
+            nn.Linear(shapes_of(self.features, input_shape)[-1].numel(), 512),
             nn.SiLU(),
             head(512, num_actions),
         )

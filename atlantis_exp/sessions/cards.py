@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -53,7 +52,7 @@ class Card:
 def read_card(folder: Path) -> tuple[Card, bytes]:
     """Read a folder's card and its weights as safetensors. Raises: ConfigError, Fault for other weights."""
     path = folder / "card.json"  # may be a link, as in a download cache: a person named this folder
-    if not os.path.exists(path):
+    if not path.exists():
         choices = {"latest", "best", *(str(card.parent) for card in folder.parent.glob("*/card.json"))}
         has = "" if folder.parent.exists() else "; the shipped weights are in pretrained/ of the repository"
         raise ConfigError(f"weights={folder}: not a folder with a card.json{has}; {nearest(str(folder), choices)}")

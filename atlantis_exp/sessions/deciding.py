@@ -106,7 +106,7 @@ class Contest:
             **self.question.identity,
             "runs": sorted(folder.name for folder in self.runs),
             "budget.steps": None,
-            **self.config.budget.limits,  # older decisions lack those that are not set
+            **self.config.budget.limits,  # older decisions lack budget.flops
             "evaluation.epsilon": self.config.evaluation.epsilon,
         }
         return RunFolder(self.outputs / "decisions" / f"decide-{digest(identity)}")
@@ -318,7 +318,7 @@ def _spread(contest: Contest) -> tuple[float, str] | None:
 def _write(journal: Journal, contest: Contest, comparison: Comparison) -> None:
     """Write the looks taken and the answer to the page."""
     header, *rows = plain("looks", comparison.tables["looks"])
-    table = "\n".join(f"| {' | '.join(row)} |" for row in (header, len(header) * ["---"], *rows))
+    table = "\n".join(f"| {' | '.join(row)} |" for row in (header, len(header) * ["---"], *rows) if rows)
     commands = [f"Continue or report: `{contest.command}`", f"Compare its runs again: `{contest.comparing}`"]
     journal.tags({"verdict": comparison.verdict})
     # MLflow cuts a long note, so what the comparison's page has, too, comes last.

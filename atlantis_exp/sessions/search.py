@@ -115,7 +115,7 @@ class Trials:
     def __init__(self, asked: Search, train: Train = train) -> None:
         config = asked.corner.config
         facts: dict[str, Any] = {"space": dict(asked.texts), "training": config.science(), "budget.steps": None}
-        facts |= config.budget.limits  # older searches lack those that are not set, and seeds
+        facts |= config.budget.limits  # older searches lack budget.flops, and seeds
         if asked.seeds > 1:
             facts["seeds"] = asked.seeds
         name = asked.name or f"search-{digest(facts)}"

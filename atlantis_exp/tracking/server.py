@@ -1,9 +1,10 @@
 """Limit the time of calls to an MLflow server."""
 
 import os
-from collections.abc import Callable
-from concurrent.futures import Future, wait
-from threading import Thread
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -27,17 +28,32 @@ class PatientClient:
 
         def bounded(*arguments: Any, **options: Any) -> Any:
             sent = os.path.getsize(arguments[1]) if name in ("log_artifact", "log_model_artifact") else 0
-            seconds, answer = self._seconds + sent // _PIECE, Future[Any]()
-
-            def ask() -> None:
-                try:
-                    answer.set_result(call(*arguments, **options))
-                except BaseException as error:
-                    answer.set_exception(error)
-
-            Thread(target=ask, daemon=True).start()
-            if not wait([answer], seconds).done:
-                raise TooSlow(f"the server did not answer in full within {seconds} seconds")
-            return answer.result()
+            with _patience(self._seconds + sent // _PIECE):
+                return call(*arguments, **options)
 
         return bounded
+
+
+@contextmanager
+def _patience(seconds: int) -> Iterator[None]:
+    """Raise TooSlow if the block takes longer, in the main thread, where alone a signal can end a wait."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    late: list[TooSlow] = []
+
+    def give_up(*_: object) -> None:
+        late.append(TooSlow(f"the server did not answer in full within {seconds} seconds"))
+        raise late[0]
+
+    before = signal.signal(signal.SIGALRM, give_up)
+    signal.alarm(seconds)
+    try:
+        yield
+    except Exception:
+        if late:  # MLflow has wrapped it
+            raise late[0] from None
+        raise
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)

@@ -5,7 +5,7 @@
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -45,14 +45,14 @@ class Played(NamedTuple):
 class Evaluations:
     """The evaluations of a training so far, as its checkpoints keep them."""
 
-    best_mean: float | None = None
-    evaluations: Annotated[int, Field(ge=0, lt=2**53)] = 0
-    evaluated_at: Annotated[int, Field(ge=-1, lt=2**53)] = -1  # step, as it was written down
-    owes_evaluation: bool = False  # of this step: it was stopped; resume repeats it
-    best_step: Annotated[int, Field(ge=-1, lt=2**53)] = -1
+    best_mean: float | None
+    evaluations: Annotated[int, Field(ge=0, lt=2**53)]
+    evaluated_at: Annotated[int, Field(ge=-1, lt=2**53)]  # step, as it was written down
+    owes_evaluation: bool  # of this step: it was stopped; resume repeats it
+    best_step: Annotated[int, Field(ge=-1, lt=2**53)]
+    last_report: str
+    last_metrics: dict[str, int | float]  # ints stay ints: resume is bit for bit
     best_sha256: str = ""  # of the weights evaluated there, as a file; missing in 0.1.0
-    last_report: str = ""
-    last_metrics: dict[str, int | float] = field(default_factory=dict)  # ints stay ints: resume is bit for bit
 
 
 class Diverged(Fault):
@@ -76,7 +76,7 @@ class Recorder:
 
     def __post_init__(self) -> None:
         self.episodes: list[Played] = []
-        self.done = Evaluations()
+        self.done = Evaluations(None, 0, -1, False, -1, "", {})
         self._pace = Pace()
         self._last_step: int | None = None
 
@@ -216,7 +216,8 @@ class Recorder:
         if not np.isfinite(self.recent_scores(len(self.episodes))).all():
             raise ValueError("the scores are not finite")
         self.done = checked(Evaluations, state)
-        if self.done.last_metrics and (missing := EVALUATED - self.done.last_metrics.keys()):
+        found = {*self.done.last_metrics} if self.done.best_mean is not None else set[str]()
+        if self.done.last_metrics and (missing := EVALUATED - found):
             raise ValueError(f"the last evaluation lacks {min(missing)}")
         self.tracker.load_state_dict(state["tracker"])
 

@@ -66,4 +66,4 @@ def test_each_shell_gets_its_script_and_another_one_a_line(
     assert command("--completion", "fsh") == 2
     printed = capsys.readouterr()
     assert printed.out == ""
-    assert "--completion: fsh: no such shell; did you mean 'fish'?" in printed.err
+    assert "--completion=fsh: no such shell; did you mean 'fish'?" in printed.err

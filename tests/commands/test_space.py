@@ -92,8 +92,14 @@ def test_an_impossible_space_is_refused_in_one_line_before_anything_starts(
     ],
 )
 def test_a_mistake_ends_the_command_with_code_2(
-    line: str, hint: str, command: Callable[..., int], capsys: pytest.CaptureFixture[str], tmp_path: Path
+    line: str,
+    hint: str,
+    command: Callable[..., int],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
 ) -> None:
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     assert command("search", *line.split(), f"paths.outputs={tmp_path}") == 2
     assert hint in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

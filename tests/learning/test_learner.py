@@ -14,7 +14,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.learning.objectives import DQN, DoubleDQN, Objective, Quantile
+from atlantis_exp.learning.values import Replicas
 from atlantis_exp.networks.cnn import DQNCnn
+from atlantis_exp.networks.cnn_norm import NormedCnn
 from atlantis_exp.networks.dropout import seed_dropout
 from atlantis_exp.networks.heads import QuantileHead
 from atlantis_exp.networks.resnet import ResNetDQN
@@ -693,6 +695,15 @@ def test_acting_follows_every_update_though_the_target_stays() -> None:
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
         expected = copy.deepcopy(learner.network).eval()(torch.from_numpy(states) / 255).float()
     np.testing.assert_array_equal(learner.q_values(states), expected.numpy())
+
+
+def test_in_bfloat16_all_layers_but_batch_normalization_are_cast() -> None:
+    """A GPU refuses layer normalization whose weights are float32."""
+    for made in (NormedCnn((2, 36, 36), 3), ResNetDQN((2, 36, 36), 3)):
+        (replica,) = Replicas(made, torch.bfloat16, 1).networks
+        for module in replica.modules():
+            dtype = torch.float32 if isinstance(module, nn.BatchNorm2d) else torch.bfloat16
+            assert {each.dtype for each in module.parameters(recurse=False)} <= {dtype}
 
 
 # Weights and errors

@@ -13,7 +13,7 @@ from atlantis_exp.learning.learner import Learner
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no GPU here")
 
-every_network = pytest.mark.parametrize("model", ["cnn", "resnet", "resnet_fast"])
+every_network = pytest.mark.parametrize("model", ["cnn", "cnn_norm", "resnet", "resnet_fast"])
 every_precision = pytest.mark.parametrize("precision", ["fp32", "bf16"])
 every_objective = pytest.mark.parametrize("objective", ["double_dqn", "quantile"])
 

@@ -1,17 +1,20 @@
 import torch
 from torch import nn
 
-from atlantis_exp.networks.sizes import count_features, count_parameters
+from atlantis_exp.networks.sizes import count_parameters, shapes_of
 
 
-def test_features_are_counted_without_a_trace_in_the_layers_or_in_random_numbers() -> None:
+def test_shapes_are_found_without_a_trace_in_the_layers_or_in_random_numbers() -> None:
     layers = nn.Sequential(nn.Conv2d(2, 3, 3, stride=2), nn.BatchNorm2d(3), nn.ReLU(inplace=True)).train()
     before = {name: value.clone() for name, value in layers.state_dict().items()}
     chance = torch.get_rng_state()
-    assert count_features(layers, (2, 11, 8)) == layers(torch.zeros(1, 2, 11, 8)).numel() == 3 * 5 * 3
+    assert shapes_of(layers, (2, 11, 8)) == 3 * [(3, 5, 3)]
     assert torch.equal(torch.get_rng_state(), chance)
     layers.load_state_dict(before)
-    count_features(layers, (2, 11, 8))
+    with torch.device("meta"):
+        assert shapes_of(layers, (2, 11, 8))[-1] == layers(torch.zeros(1, 2, 11, 8, device="cpu"))[0].shape
+    layers.load_state_dict(before)
+    shapes_of(layers, (2, 11, 8))
     assert layers.training
     for name, value in layers.state_dict().items():
         assert torch.equal(value, before[name])

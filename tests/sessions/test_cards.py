@@ -161,9 +161,8 @@ def test_a_folder_of_this_place_is_named_without_a_path(folder: Path, monkeypatc
     monkeypatch.chdir(folder.parent)
     ((_, config),) = check("evaluate", EvaluateConfig, ["weights=untrained"]).items()
     assert config.weights == "untrained"
-    for name in ("untraind", 300 * "a"):  # the second is too long for a file's name
-        with pytest.raises(ConfigError, match=f"weights={name}: not a folder"):
-            check("evaluate", EvaluateConfig, [f"weights={name}"])
+    with pytest.raises(ConfigError, match="weights=untraind: not a folder"):
+        check("evaluate", EvaluateConfig, ["weights=untraind"])
 
 
 def test_weights_are_packed_in_half_precision_only_above_eight_megabytes() -> None:

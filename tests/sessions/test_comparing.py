@@ -87,8 +87,9 @@ def test_a_comparison_of_more_seeds_goes_on_in_its_run_and_one_that_fails_says_s
     assert "next look at 10 seeds (there are 6 each)" in stored.data.tags["mlflow.note.content"]
     (looks,) = tmp_path.glob("comparisons/*/looks.json")
     looks.write_text("{")
-    with pytest.raises(Fault, match=r"looks\.json"):
+    with pytest.raises(Fault, match=r"looks\.json") as damaged:
         VERB.run([f"paths.outputs={tmp_path}", "tracking=none"])
+    assert damaged.value.exit_code == 1
     assert RunFolder(looks.parent).state == "failed"
 
 
