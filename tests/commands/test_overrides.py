@@ -309,8 +309,16 @@ def test_what_is_right_passes(line: str) -> None:
 @example("12")
 @example("postgresql://u@h/d")
 @example('\\"\\')
+@example("./mine")
+@example("...")
 def test_a_printed_command_holds_the_value(text: str) -> None:
     assert read_override(f"key={quoted(text)}").value() == text
+
+
+@pytest.mark.parametrize("path", ["mine", "./mine", "../mine.py", "/tmp/mine@0a"])
+def test_a_plain_path_is_printed_without_quotes(path: str) -> None:
+    assert quoted(path) == path
+    assert read_override(f"key={path}").value() == path
 
 
 @pytest.mark.parametrize("typed", ["'./a,b/x.py'", '"./a,b/x.py"', "['./a,b/x.py']", '["./a,b/x.py",other]'])
