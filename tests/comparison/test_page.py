@@ -136,7 +136,7 @@ def test_two_bands_at_most_lie_over_each_other(recorded: Recorded, tmp_path: Pat
     [
         (12_345.6, "score", "12,346"),
         (0.0, "low", "0"),
-        (0.25, "probability", "25.0%"),
+        (0.25, "random_share", "25.0%"),
         (0.05, "epsilon", "0.05"),
         (3, "seed", "3"),
         (1.5e12, "flops", "1.5e+12"),
