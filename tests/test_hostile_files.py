@@ -382,6 +382,7 @@ FORGERIES: dict[str, Callable[[State, ReplayMemory], object]] = {
     "scores that are not numbers": lambda state, _: state["episodes"].fill(np.nan),
     "lengths of other episodes": lambda state, _: state.update(lengths=np.zeros(7, np.int64)),
     "half an evaluation": lambda state, _: state.update(last_metrics={"evaluation/mean": 1.0}),
+    "an evaluation without a best mean": lambda state, _: state.update(best_mean=None),
     "a best mean in words": lambda state, _: state.update(best_mean="good"),
     "an emulator's action that the game lacks": lambda state, _: state["emulators"]["0"]["actions"].fill(99),
     "an emulator of nothing": lambda state, _: state["emulators"]["0"].update(ale=np.zeros(0, np.uint8)),

@@ -86,6 +86,7 @@ def test_what_the_answers_rank_is_ranked_so_by_the_kept_runs() -> None:
     assert max(means["in_the_reports_game"]) < min(means["cnn"])
     clipped = [games.scores.mean() for games in publish.in_the_fields_game()]
     assert min(clipped) < min(means["power"]) < max(clipped)
+    assert min(games.scores.mean() for games in publish.with_layer_normalization()) > max(means["power"])
     assert max(means["gaps"][0], means["longer_discount"][0]) < min(means["power"])
 
 

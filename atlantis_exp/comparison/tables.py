@@ -66,8 +66,15 @@ class Comparison:
                 "verdicts": verdicts,
                 "scores": [row | {"seeds": seeds[row["family"], row["group"]]} for row in scores],
                 "looks": [
-                    row | {key: row[key].split() for key in ("planned", "taken")} | {"next": row["next_look"] or None}
-                    for row in self.tables["plan"]
+                    {
+                        "family": each.family.name,
+                        "planned": each.family.plan.looks,
+                        "taken": [look.size for look in each.decision.looks],
+                        "next": each.decision.next_look,
+                        "error": each.family.plan.error,
+                        "spent": each.decision.spent,
+                    }
+                    for each in self.answers
                 ],
             }
         )

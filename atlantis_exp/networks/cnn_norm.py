@@ -18,4 +18,5 @@ class NormedCnn(DQNCnn):
         plain, layers = (*self.features, *self.fc), list[nn.Module]()
         for layer, shape in zip(plain, shapes_of(plain, input_shape), strict=True):
             layers += [nn.LayerNorm(shape), layer] if isinstance(layer, nn.ReLU) else [layer]
-        self.features, self.fc = nn.Sequential(*layers[:10]), nn.Sequential(*layers[10:])
+        end = layers.index(self.fc[0])
+        self.features, self.fc = nn.Sequential(*layers[:end]), nn.Sequential(*layers[end:])

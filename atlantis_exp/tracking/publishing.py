@@ -161,8 +161,12 @@ def lacking(outputs: Path) -> list[RunFolder]:
     if not (outputs / DATABASE).exists():
         return folders
     store = f"{Store(outputs).uri}#"
-    cursors = {folder: [Cursor.read(note) for note in folder.path.glob("published*.json")] for folder in folders}
-    return [folder for folder in folders if not any(each and each.store.startswith(store) for each in cursors[folder])]
+
+    def is_known(folder: RunFolder) -> bool:
+        cursors = map(Cursor.read, folder.path.glob("published*.json"))
+        return any(cursor and cursor.store.startswith(store) for cursor in cursors)
+
+    return [folder for folder in folders if not is_known(folder)]
 
 
 def how_to_open(outputs: Path) -> str:

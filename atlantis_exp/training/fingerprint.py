@@ -22,8 +22,7 @@ def fingerprint(state: Mapping[str, Any], memory: ReplayMemory, folder: Path) ->
     parts["learner"] = learner
     parts["replay"] = memory.state_dict()
     parts["history"] = {str(index): event for index, event in enumerate(history(folder))}
-    files = {name: b"".join(files_of({"part": part}).values()) for name, part in sorted(parts.items())}
-    return {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    return {name: _digest(part) for name, part in sorted(parts.items())}
 
 
 def history(folder: Path) -> list[dict[str, Any]]:
@@ -36,3 +35,7 @@ def history(folder: Path) -> list[dict[str, Any]]:
             fields["values"] = {name: value for name, value in values.items() if name not in WALL_CLOCK}
             events.append(fields)
     return events
+
+
+def _digest(tree: Any) -> str:
+    return hashlib.sha256(b"".join(files_of({"part": tree}).values())).hexdigest()

@@ -216,9 +216,10 @@ class Recorder:
         if not np.isfinite(self.recent_scores(len(self.episodes))).all():
             raise ValueError("the scores are not finite")
         self.done = checked(Evaluations, state)
-        found = {*self.done.last_metrics} if self.done.best_mean is not None else set[str]()
-        if self.done.last_metrics and (missing := EVALUATED - found):
+        if self.done.last_metrics and (missing := EVALUATED - self.done.last_metrics.keys()):
             raise ValueError(f"the last evaluation lacks {min(missing)}")
+        if self.done.last_metrics and self.done.best_mean is None:
+            raise ValueError("the best mean of its evaluations is missing")
         self.tracker.load_state_dict(state["tracker"])
 
     def _write_episodes(self) -> None:

@@ -111,6 +111,7 @@ def test_without_optuna_the_extra_is_named(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> None:
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     monkeypatch.delitem(sys.modules, "atlantis_exp.sessions.search", raising=False)
     monkeypatch.setitem(sys.modules, "optuna", None)
     assert command("search", "optimizer=adam,rmsprop", f"paths.outputs={tmp_path}") == 2

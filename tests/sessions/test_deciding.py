@@ -147,12 +147,12 @@ def test_decided_pairs_are_dropped_and_each_look_is_on_the_page_once(
     assert contest.folder.title == "decide optimizer.lr=0.001,0.002,0.003"
     assert said["verdict"].startswith("lr=0.001 plays better than lr=0.002")
     note = said[NOTE]
-    row = r"^\| (\d+) \| (\d+) \| ([\d.]+%) \| (.+) \| (.+) \| [\d,]+ \(.+ to .+\) \| (.+) \|$"
+    row = r"^\| (\d+) \| (\d+) \| ([\d.]+%) \| (.+) \| (.+) \| ([\d,]+) \(.+ to .+\) \| (.+) \|$"
     assert re.findall(row, note, re.MULTILINE) == [
-        ("1", "5", "1.25%", "lr=0.001", "lr=0.002", "better"),
-        ("1", "5", "1.25%", "lr=0.001", "lr=0.003", "better"),
-        ("1", "5", "1.25%", "lr=0.002", "lr=0.003", "not decided"),
-        ("2", "10", "3.75%", "lr=0.002", "lr=0.003", "not decided"),
+        ("1", "5", "1.25%", "lr=0.001", "lr=0.002", "8,000", "better"),
+        ("1", "5", "1.25%", "lr=0.001", "lr=0.003", "8,000", "better"),
+        ("1", "5", "1.25%", "lr=0.002", "lr=0.003", "0", "not decided"),
+        ("2", "10", "3.75%", "lr=0.002", "lr=0.003", "0", "not decided"),
     ]
     assert f"`{contest.command}`" in note
     assert f"`{contest.comparing}`" in note
