@@ -698,7 +698,7 @@ def test_acting_follows_every_update_though_the_target_stays() -> None:
 
 
 def test_in_bfloat16_all_layers_but_batch_normalization_are_cast() -> None:
-    """A GPU refuses layer normalization whose weights are float32."""
+    """By what torch's authors say, a GPU refuses layer normalization whose weights are of another type."""
     for made in (NormedCnn((2, 36, 36), 3), ResNetDQN((2, 36, 36), 3)):
         (replica,) = Replicas(made, torch.bfloat16, 1).networks
         for module in replica.modules():
