@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from atlantis_exp.comparison.decision import Plan, decide, equivalence, mean_interval
+from atlantis_exp.comparison.decision import Look, Plan, Verdict, decide, equivalence, mean_interval, size_found
 from atlantis_exp.comparison.estimands import score_of
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.components import game_of
@@ -34,7 +34,7 @@ SOURCES = (*pace.PAID, "wave_bonus")  # of points
 RANDOM = 20_873  # the mean of a random player
 PEERS = ("DreamerV3", "QR-DQN Impala ResNet", "QR-DQN Nature CNN")
 PUBLISHED = {(row["name"], row["frames"]): row["mean"] for row in curves(game_of("Atlantis-v0"))}
-LAB, REPRODUCTION, ASKED = "lab/results.md", "lab/reproduction.md", "lab/questions.md"
+ANSWERS, LAB, REPRODUCTION, ASKED = "docs/results.md", "lab/results.md", "lab/reproduction.md", "lab/questions.md"
 
 
 def games_at(run: RunFolder, step: int | None = None) -> EpisodeTable:
@@ -138,6 +138,8 @@ def of_the_verdicts() -> Iterator[tuple[str, str]]:
     for looks in sorted((RESULTS / "verdict" / "comparisons").glob("*/looks.json")):
         for look in json.loads(looks.read_text()).popitem()[1]:
             (verdict,) = look["verdicts"]
+            if verdict["said"] != "not decided":
+                yield ANSWERS, f"{size_found(Verdict(**verdict), Look(**look), 1):,.0f}"
             yield from (
                 (LAB, text.lstrip("-")) for text in whole(verdict[key] for key in ("difference", "low", "high"))
             )
@@ -345,7 +347,7 @@ SECTIONS = (
 def numbers() -> dict[str, list[str]]:
     """Return all published numbers by page."""
     said = list(dict.fromkeys(itertools.chain.from_iterable(section() for section in SECTIONS)))
-    return {page: [text for of, text in said if of == page] for page in (LAB, REPRODUCTION, ASKED)}
+    return {page: [text for of, text in said if of == page] for page in (ANSWERS, LAB, REPRODUCTION, ASKED)}
 
 
 @cache
@@ -395,7 +397,7 @@ def main() -> None:
     """Write the file of numbers and the tables of the pages."""
     (RESULTS / "numbers.json").write_text(json.dumps(numbers(), indent=1) + "\n")
     made = tables()
-    for name in ("docs/results.md", "docs/reproduction.md"):
+    for name in (ANSWERS, "docs/reproduction.md"):
         path = REPOSITORY / name
         path.write_text(with_tables(path.read_text(), made))
 

@@ -107,7 +107,7 @@ def conditions(facts: Facts) -> Iterator[str]:
             times = f"{found.spreads:.1f} times as much in one group"
             here = times if isfinite(found.spreads) else "those of one group do not vary"
             yield (
-                f"{one} against {other}: a look overstates the difference that it finds; the true one is rather "
+                f"{one} against {other}: a look overstates the difference that it finds; the corrected estimate is "
                 f"{size} points. The verdict assumes that seeds vary alike (here {here}). It would not hold if "
                 f"{found.undone_by:.0%} of the seeds of {one} collapsed; {verdict.seeds} seeds "
                 f"cannot exclude up to {found.unseen:.0%}."

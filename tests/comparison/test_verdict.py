@@ -756,7 +756,7 @@ def test_a_verdict_says_its_condition_and_its_size_where_a_look_found_it() -> No
     found = compared(around("a", 1_000, range(10)) + around("b", 950, range(10)))
     (line,) = (note for note in found.caveats if "collapsed" in note)
     assert line.startswith("a against b: ")
-    assert re.search(r"the true one is rather (4\d|50) points\.", line)
+    assert re.search(r"the corrected estimate is (4\d|50) points\.", line)
     assert "would not hold if 5% of the seeds of a collapsed" in line
     assert re.search(r"1\.0 times as much .* cannot exclude up to (26|45)%", line)
     assert not [note for note in compared(around("a", 1_000) + around("b", 1_000)).caveats if "collapsed" in note]
