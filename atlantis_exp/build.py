@@ -29,7 +29,7 @@ from atlantis_exp.networks.dropout import seed_dropout
 from atlantis_exp.networks.heads import DuelingHead, Head, QuantileHead
 from atlantis_exp.replay.memory import ReplayMemory, Returns, Window
 from atlantis_exp.runs.folder import CHECKPOINTS
-from atlantis_exp.runs.journal import Tracker
+from atlantis_exp.runs.journal import Journal
 from atlantis_exp.training.actor import Actor, ConstantActor, EpsilonGreedy, PersonActor, RandomActor, RecurrentGreedy
 from atlantis_exp.training.checkpoint import Checkpoints
 from atlantis_exp.training.evaluator import Evaluator
@@ -367,7 +367,7 @@ def build_cadence(evaluation: cfg.EvaluationConfig, tracking: cfg.TrackingConfig
 
 
 def build_trainer(
-    config: cfg.Config, cores: int, folder: Path, tracker: Tracker, progress: Progress, about: str = ""
+    config: cfg.Config, cores: int, folder: Path, tracker: Journal, progress: Progress, about: str = ""
 ) -> Trainer:
     """Return a trainer that writes under `folder` only; `about` is part of the run's description, in markdown."""
     env = config.env

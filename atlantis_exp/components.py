@@ -293,6 +293,9 @@ def _check_game(cls: type[Any], settings: Sequence[Setting]) -> None:
     low, high = cls.score_range
     if not -math.inf < low < high < math.inf:
         raise TypeError(f"score_range: should be the lowest and the highest score, not ({low}, {high})")
+    for source in getattr(cls, "sources", ()):
+        if not re.fullmatch(r"\w[\w.\- ]{0,99}", source, re.ASCII):  # it names a metric
+            raise TypeError(f"sources: '{source}' should have letters, digits and '_.- ' only")
     if getattr(cls, "sources", ()):
         try:
             inspect.signature(getattr(cls, "points", None)).bind("reward", "ram")  # type: ignore[arg-type]

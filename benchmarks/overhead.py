@@ -12,7 +12,7 @@ import functools
 import statistics
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from atlantis_exp.components import facts_of, game_of
-from atlantis_exp.runs.journal import Journal, Tracker
+from atlantis_exp.runs.journal import Journal
 from atlantis_exp.tracking.publishing import Publisher
 from atlantis_exp.tracking.store import Store
 from atlantis_exp.training.evaluation import Episode, Evaluation
@@ -43,10 +43,17 @@ class Turn(NamedTuple):
     evaluation: float  # bookkeeping of one evaluation
 
 
+class Untracked:
+    """A tracker that forgets all records."""
+
+    def __getattr__(self, name: str) -> Callable[..., dict[str, Any]]:
+        return lambda *_, **__: {}
+
+
 class Timed:
     """A tracker that adds up the time in its methods."""
 
-    def __init__(self, tracker: Tracker) -> None:
+    def __init__(self, tracker: Journal) -> None:
         self.tracker = tracker
         self.seconds = 0.0
 
@@ -76,16 +83,16 @@ def training(tracked: bool, commit_seconds: float) -> Iterator[Measure[Turn]]:
     )
     publishers = []
 
-    def tracker_of(folder: Path) -> Tracker:
+    def tracker_of(folder: Path) -> Journal:
         if not tracked:
-            return Tracker()
+            return cast(Journal, Untracked())
         journal = Journal(folder)
         publishers.append(Publisher(folder, Store(folder / "store", "overhead")))
         return journal
 
     with learning(config, tracker_of) as trainer:
         tracker = Timed(trainer.recorder.tracker)
-        trainer.recorder.tracker = cast(Tracker, tracker)
+        trainer.recorder.tracker = cast(Journal, tracker)
         trainer.recorder.play = lambda *_: _evaluation()
         clocks = [
             time.pthread_getcpuclockid(thread.ident)

@@ -27,7 +27,7 @@ from rich.console import Console
 from atlantis_exp.build import build_evaluator, build_trainer
 from atlantis_exp.config import Config
 from atlantis_exp.machine import here
-from atlantis_exp.runs.journal import Tracker
+from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.training.actor import EpsilonGreedy, States
 from atlantis_exp.training.progress import Progress
@@ -75,7 +75,7 @@ def ours(judge: Judge) -> Iterator[Measure[Turn]]:
     config = composed("experiment=fast", *GAME, *quiet)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         set_up_torch(config, config.device)
-        trainer = build_trainer(config, here().cores, Path(folder), Tracker(), _QUIET)
+        trainer = build_trainer(config, here().cores, Path(folder), Journal(Path(folder)), _QUIET)
         stack.callback(trainer.emulators.close)
 
         def measure(seconds: float) -> Turn:

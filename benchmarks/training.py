@@ -22,7 +22,7 @@ from rich.console import Console
 from atlantis_exp.build import build_trainer
 from atlantis_exp.config import Config
 from atlantis_exp.machine import here
-from atlantis_exp.runs.journal import Journal, Tracker
+from atlantis_exp.runs.journal import Journal
 from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.training.progress import Progress
 from atlantis_exp.training.trainer import Trainer
@@ -78,7 +78,7 @@ def training_config(batch_size: int, every: int, *overrides: str) -> Config:
 
 
 @contextmanager
-def learning(config: Config, tracker_of: Callable[[Path], Tracker] = Journal) -> Iterator[Trainer]:
+def learning(config: Config, tracker_of: Callable[[Path], Journal] = Journal) -> Iterator[Trainer]:
     """A learning trainer in a temporary folder."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         set_up_torch(config, config.device)

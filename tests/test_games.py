@@ -157,6 +157,7 @@ class Mine:
             (GAME.format(name="pong").replace("(0.0, 100.0)", text), "score_range: should be ")
             for text in ("(5.0, 2.0)", "(864.0,)", '("a", "b")', "(0.0, 1e999)")
         ),
+        (GAME.format(name="pong") + "    sources = ('a/b',)\n", "sources: 'a/b' should have letters, digits and"),
         (GAME.format(name="pong") + "    keys = ('up', 'down')\n", "keys: should be a tuple[tuple[str, str], ...]"),
         *(
             (GAME.format(name="pong") + f"    sources = ('bricks',)\n{method}", "sources: need a static method points(")

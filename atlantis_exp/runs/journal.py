@@ -8,12 +8,11 @@ checkpoint has that state. A resumed run repeats later steps and journals them a
 import hashlib
 import json
 import os
-import re
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, get_args
 from uuid import uuid4
@@ -122,52 +121,14 @@ class JournalError(Fault, ValueError):
 _POINT_BYTES = 2_000  # between two points of `curve`; about three lines of a journal
 
 
-class Tracker:
-    """The null object of tracking, which forgets all records."""
-
-    def metrics(self, values: Mapping[str, float], step: int) -> None:
-        """Record values measured at a step."""
-
-    def params(self, values: Mapping[str, str]) -> None:
-        """Record the settings of the run."""
-
-    def tags(self, values: Mapping[str, str]) -> None:
-        """Record facts about the run."""
-
-    def note(self, markdown: str) -> None:
-        """Describe the run and its result so far; the last note counts."""
-
-    def artifact(self, path: str, content: bytes) -> None:
-        """Keep a file under a relative path; the last content of a path counts."""
-
-    def image(self, key: str, content: bytes, step: int) -> None:
-        """Keep a PNG at a position of its key's slider; MLflow shows runs with equal positions side by side."""
-
-    def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None:
-        """Keep weights (safetensors) of a step and their metrics; `best` of all with the name so far."""
-
-    def status(self, status: Status, error: str = "") -> None:
-        """Make the run's state and the reason of a failure visible, but no records."""
-
-    def commit(self) -> None:
-        """Make all records of the latest state visible; call it when a checkpoint with that state is durable."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Make all records durable and return their end."""
-        return {}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go back to the state's end and forget later records."""
-
-
-class Journal(Tracker):
-    """A tracker that writes a run folder, which has one writer at a time.
+class Journal:
+    """The journal of a run folder, which has one writer at a time.
 
     Without `load_state_dict` it starts an empty journal, even in a folder that has one.
 
     Raises:
         JournalError: `commit.json` or a line is damaged, or the journal was cut or replaced meanwhile.
-        ValueError: MLflow would refuse a name, or a path leads out of `artifacts/`.
+        ValueError: a path leads out of `artifacts/`.
         OSError: the disk refuses; durable lines stay, and a later `state_dict` writes the rest.
     """
 
@@ -181,8 +142,7 @@ class Journal(Tracker):
         commit = read_commit(folder) or _new_commit()
         if commit.status == "SCHEDULED":
             commit = replace(commit, started=self._time, status="RUNNING")
-        named = {_name(key): value for key, value in (labels or {}).items()}
-        self._commit = replace(commit, labels={**commit.labels, **named})
+        self._commit = replace(commit, labels={**commit.labels, **(labels or {})})
 
     def resume(self) -> bool:
         """Continue after the last commit, without a checkpoint; return whether there is one."""
@@ -199,41 +159,49 @@ class Journal(Tracker):
         self.status("FINISHED")
 
     def metrics(self, values: Mapping[str, float], step: int) -> None:
+        """Record values measured at a step."""
         self._time = max(self._time, _now())
-        self._append(Metrics(step, self._time, _numbers(values)))
+        self._append(Metrics(step, self._time, {key: float(value) for key, value in values.items()}))
 
     def params(self, values: Mapping[str, str]) -> None:
-        self._append(Params(_named(values)))
+        """Record the settings of the run."""
+        self._append(Params(dict(values)))
 
     def tags(self, values: Mapping[str, str]) -> None:
-        self._append(Tags(_named(values)))
+        """Record facts about the run."""
+        self._append(Tags(dict(values)))
 
     def note(self, markdown: str) -> None:
-        """Append a note, unless it is the last one that this process appended."""
+        """Describe the run so far in markdown, unless that is the last note; the last one counts."""
         if markdown != self._noted:
             self.tags({NOTE: markdown})
             self._noted = markdown
 
     def artifact(self, path: str, content: bytes) -> None:
+        """Keep a file under a relative path; the last content of a path counts."""
         self._append(Artifact(path, self._write(path, content)))
 
     def image(self, key: str, content: bytes, step: int) -> None:
-        path = f"images/{_name(key)}/{step}.png"
+        """Keep a PNG at a position of its key's slider; MLflow shows runs with equal positions side by side."""
+        path = f"images/{key}/{step}.png"
         self._write(path, content)
         self._append(Image(key, step, self._time, path))
 
     def model(self, name: str, content: bytes, step: int, metrics: Mapping[str, float], best: bool = False) -> None:
-        if set("/.") & set(name):
-            raise ValueError(f"A model's name must not contain '/' or '.': {name!r}")
-        path = model_file(_name(name), step)
+        """Keep weights (safetensors) of a step and their metrics; `best` of all with the name so far."""
+        path = model_file(name, step)
         digest = self._write(path, content)
         # MLflow charts a model's metrics on the run, too: with the time of the last metrics they coincide.
-        self._append(Model(name, step, self._time, path, _numbers(metrics), best, digest))
+        self._append(
+            Model(name, step, self._time, path, {key: float(value) for key, value in metrics.items()}, best, digest)
+        )
 
     def status(self, status: Status, error: str = "") -> None:
+        """Make the run's state and the reason of a failure visible, but no records."""
         self._mark(replace(self._commit, status=status, error=error))
 
     def commit(self) -> None:
+        """Make all records of the latest state visible; call it when a checkpoint with that state is durable."""
         self._mark(replace(self._commit, offset=self._offset))
 
     def flush(self) -> None:
@@ -247,6 +215,7 @@ class Journal(Tracker):
         self.status("FINISHED")
 
     def state_dict(self) -> dict[str, Any]:
+        """Make all records durable and return their end."""
         if self._offset < self._commit.offset:
             self._mark(replace(self._commit, offset=self._offset))  # tell readers before the bytes change
         content = b"".join(self._lines)
@@ -256,6 +225,7 @@ class Journal(Tracker):
         return {"offset": self._offset, "time": self._time}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go back to the state's end and forget later records."""
         path = self._folder / "journal.jsonl"
         try:
             if path.stat().st_size < state["offset"]:
@@ -411,29 +381,12 @@ def _line(file: BinaryIO, start: int, end: int) -> bytes:
     raise ValueError(f"{file.name} ends at byte {start + len(line)}, before its commit at {end}")
 
 
-def _named(values: Mapping[str, str]) -> dict[str, str]:
-    return {_name(key): value for key, value in values.items()}
-
-
-def _numbers(values: Mapping[str, float]) -> dict[str, float]:
-    return {_name(key): float(value) for key, value in values.items()}
-
-
 def _new_commit() -> Commit:
     return Commit(uuid4().hex, _now(), _now(), 0, "SCHEDULED")
 
 
 def _write_commit(folder: Path, commit: Commit) -> None:
     write_file(folder / "commit.json", commit_bytes(commit))
-
-
-@lru_cache(maxsize=4096)
-def _name(name: str) -> str:
-    if len(name) > 250 or not re.fullmatch(r"\w[\w.\- ]*(/\w[\w.\- ]*)*", name, re.ASCII):
-        raise ValueError(
-            f"MLflow's names have up to 250 letters, digits, '_.- ' and single inner slashes, not {name!r}"
-        )
-    return name
 
 
 def _now() -> int:

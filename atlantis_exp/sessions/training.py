@@ -21,7 +21,7 @@ from atlantis_exp.faults import ConfigError, Fault, in_words
 from atlantis_exp.game.vector import WorkerDied
 from atlantis_exp.runs.files import write_file
 from atlantis_exp.runs.folder import CONFIG, LOST, TRACEBACK, Result, RunFolder, all_runs
-from atlantis_exp.runs.journal import Journal, Tracker, adopt, has_lost_commit
+from atlantis_exp.runs.journal import Journal, adopt, has_lost_commit
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.cards import read_card
 from atlantis_exp.sessions.job import Job, labels, replaced
@@ -235,7 +235,7 @@ def measure(
     set_up_torch(config, config.device)
     with terminal.working(said), tempfile.TemporaryDirectory() as aside:
         progress = Progress(Console(quiet=True))
-        trainer = build_trainer(config, cores or job.machine.cores, Path(aside), Tracker(), progress)
+        trainer = build_trainer(config, cores or job.machine.cores, Path(aside), Journal(Path(aside)), progress)
         with trainer.emulators:
             return trainer, _expected(trainer, config, Counters())
 

@@ -43,9 +43,8 @@ _log = logging.getLogger(__name__)
 
 PRIMARY = "published.json"
 """A run folder's file with its cursor in the store of its own sessions."""
-PLACE = r"([a-z]+)/[A-Za-z0-9][A-Za-z0-9_.,~+=@-]{0,199}"
-"""A run folder's place in an outputs folder."""
-_PARENT = rf"\.\./\.\./{PLACE}"  # a run folder's path to its parent
+_PARENTS = ("sweeps", "searches")  # folders of parents, which have none themselves
+_PARENT = rf"\.\./\.\./({'|'.join(_PARENTS)})/[A-Za-z0-9][A-Za-z0-9_.,~+=@-]{{0,199}}"
 
 _POINTS = 5_000  # a batch: smaller ones cost more a point
 _PIXELS = 4_096  # a side, of a picture: a file of some kilobytes can unpack to gigabytes
@@ -155,25 +154,13 @@ def _opened(cursor: Cursor | None, note: Path, folder: Path, store: Store, commi
 
 def _parent_run(folder: Path, store: Store, commit: Commit, is_primary: bool) -> str | None:
     """Publish a folder's parent if needed, and return its run."""
-    _check_parents(folder, commit.parent)
     parent = Path(os.path.normpath(folder / commit.parent))
-    if not re.fullmatch(_PARENT, commit.parent) or parent.is_symlink() or not parent.exists():
+    is_named = folder.parent.name not in _PARENTS and re.fullmatch(_PARENT, commit.parent)
+    if not is_named or parent.is_symlink() or not parent.exists():
         return None
     publish(parent, store, is_primary)
     cursor = Cursor.read(_note(parent, store, is_primary))
     return cursor.run_id if cursor else None
-
-
-def _check_parents(folder: Path, parent: str) -> None:
-    """Raise ValueError if the parents form a cycle."""
-    places = [Path(os.path.normpath(folder))]
-    while re.fullmatch(_PARENT, parent):
-        place = Path(os.path.normpath(places[-1] / parent))
-        if place in places:
-            raise ValueError(f"{place} is its own parent")
-        places.append(place)
-        commit = None if place.is_symlink() else read_commit(place)
-        parent = commit.parent if commit else ""
 
 
 class _Mirror:

@@ -4,11 +4,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from math import isnan
 from typing import TYPE_CHECKING
 
-import numpy as np
 from rich.console import Console
 from rich.live import Live
 from rich.progress_bar import ProgressBar
@@ -59,26 +57,6 @@ class Pace:
         return (self._latest[1] - self._marks[0][1]) / seconds
 
 
-@dataclass(frozen=True)
-class Snapshot:
-    """The progress of a training."""
-
-    episode: int  # under way, counted from 1
-    scores: Sequence[float]  # of the last 20 episodes
-    lengths: Sequence[int]  # of the last 100 episodes, steps
-    epsilon: float
-    steps: int
-    updates: int
-    steps_per_second: float
-    phase: str
-    steps_left: float | None  # until the plan or the budget ends; None if unknown
-
-    @property
-    def share(self) -> float:
-        """The completed share of the training, in steps."""
-        return 0.0 if self.steps_left is None else self.steps / (self.steps + max(self.steps_left, 0.0))
-
-
 class Progress:
     """Show episode, score, mean of 20, epsilon, steps a second, phase and time left."""
 
@@ -99,14 +77,14 @@ class Progress:
             return self._shown is None or time.monotonic() - self._shown >= _DRAW_SECONDS
         return self._is_time_for_a_line()
 
-    def show(self, snapshot: Snapshot) -> None:
-        """Draw a training's bar, or write its line."""
+    def show(self, line: str, share: float) -> None:
+        """Draw a training's bar with its line and completed share, or write the line."""
         if not self.console.is_terminal:
-            self._write(_line(snapshot))
+            self._write(line)
             return
         self._shown = time.monotonic()
         table = Table.grid(padding=(0, 1))
-        table.add_row(ProgressBar(total=1.0, completed=snapshot.share, width=24), _line(snapshot))
+        table.add_row(ProgressBar(total=1.0, completed=share, width=24), line)
         if self._live is None:
             self._live = Live(table, console=self.console, transient=True, auto_refresh=False)
             self._live.start()
@@ -166,20 +144,3 @@ class Progress:
         if self._live is not None:
             self._live.stop()
             self._live = None
-
-
-def _line(snapshot: Snapshot) -> str:
-    shown = "first episode"
-    if snapshot.scores:
-        shown = (
-            f"score {snapshot.scores[-1]:,.0f}  mean of 20 {np.mean(snapshot.scores):,.0f}  "
-            f"duration {snapshot.lengths[-1]:,} (mean of 100 {np.mean(snapshot.lengths):,.0f})"
-        )
-    left = "?"
-    if snapshot.steps_left is not None and snapshot.steps_per_second > 0 and snapshot.updates:
-        left = terminal.clock(snapshot.steps_left / snapshot.steps_per_second)  # steps are faster without updates
-    return (
-        f"episode {snapshot.episode:,}  {shown}  epsilon {snapshot.epsilon:.2f}  "
-        f"step {snapshot.steps:,}  updates {snapshot.updates:,}  {snapshot.steps_per_second:,.0f} steps/s  "
-        f"phase {snapshot.phase}  {snapshot.share:.1%}  left {left}"
-    )

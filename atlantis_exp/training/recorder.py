@@ -11,17 +11,18 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from atlantis_exp import terminal
 from atlantis_exp.faults import Fault
 from atlantis_exp.learning.learner import Learner
 from atlantis_exp.media import score_heatmap, score_histogram
 from atlantis_exp.replay.memory import ReplayMemory
 from atlantis_exp.runs.files import checked
 from atlantis_exp.runs.folder import BEST_EPISODE, EPISODES, EVALUATED, NETWORK, TABLE_COLUMNS, evaluation_at
-from atlantis_exp.runs.journal import Tracker
+from atlantis_exp.runs.journal import Journal
 from atlantis_exp.training.checkpoint import to_safetensors
 from atlantis_exp.training.evaluation import Evaluation, Stopped
 from atlantis_exp.training.plan import Cadence, Counters, Plan
-from atlantis_exp.training.progress import Pace, Progress, Snapshot
+from atlantis_exp.training.progress import Pace, Progress
 
 Stop = Callable[[], bool]
 Play = Callable[[int, Progress, Stop], Evaluation]
@@ -67,7 +68,7 @@ class Recorder:
     cadence: Cadence
     learner: Learner
     memory: ReplayMemory
-    tracker: Tracker
+    tracker: Journal
     progress: Progress
     play: Play
     film: Film
@@ -152,7 +153,7 @@ class Recorder:
         """Show the progress if due; call it after every step."""
         self._pace.tick(counters.steps)
         if self.progress.is_due():
-            self.progress.show(self._snapshot(counters))
+            self.progress.show(*self._line(counters))
 
     def evaluate(self, counters: Counters, num_envs: int, has_ended: bool, stop: Stop) -> None:
         """Evaluate this step's network and keep its weights; pending if stopped. Raises: Diverged."""
@@ -245,19 +246,25 @@ class Recorder:
             ]
         self.tracker.note("\n\n".join([*lines, self.about]))
 
-    def _snapshot(self, counters: Counters) -> Snapshot:
-        done, length = self.plan.done(counters), self.plan.length
-        left = counters.steps * (length - done) / done if done else None
+    def _line(self, counters: Counters) -> tuple[str, float]:
+        """Return the progress in words, and the completed share of the training, in steps."""
+        steps, done, length = counters.steps, self.plan.done(counters), self.plan.length
+        left = steps * (length - done) / done if done else None  # steps
         if left is not None and self._last_step is not None:
-            left = min(left, self._last_step - counters.steps)
-        return Snapshot(
-            episode=counters.episodes + 1,
-            scores=self.recent_scores(20),
-            lengths=[played.length for played in self.episodes[-100:]],
-            epsilon=self.plan.epsilon_at(counters),
-            steps=counters.steps,
-            updates=self.learner.updates,
-            steps_per_second=self._pace.steps_per_second,
-            phase=self.plan.phase_at(counters).name,
-            steps_left=left,
+            left = min(left, self._last_step - steps)
+        share = 0.0 if left is None else steps / (steps + max(left, 0.0))
+        shown, time_left, pace = "first episode", "?", self._pace.steps_per_second
+        if scores := self.recent_scores(20):
+            lengths = [played.length for played in self.episodes[-100:]]
+            shown = (
+                f"score {scores[-1]:,.0f}  mean of 20 {np.mean(scores):,.0f}  "
+                f"duration {lengths[-1]:,} (mean of 100 {np.mean(lengths):,.0f})"
+            )
+        if left is not None and pace > 0 and self.learner.updates:
+            time_left = terminal.clock(left / pace)  # steps are faster without updates
+        line = (
+            f"episode {counters.episodes + 1:,}  {shown}  epsilon {self.plan.epsilon_at(counters):.2f}  "
+            f"step {steps:,}  updates {self.learner.updates:,}  {pace:,.0f} steps/s  "
+            f"phase {self.plan.phase_at(counters).name}  {share:.1%}  left {time_left}"
         )
+        return line, share

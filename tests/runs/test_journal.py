@@ -1,6 +1,5 @@
 import hashlib
 import json
-import math
 import os
 import resource
 import shutil
@@ -29,7 +28,6 @@ from atlantis_exp.runs.journal import (
     Params,
     Record,
     Tags,
-    Tracker,
     adopt,
     curve,
     has_lost_commit,
@@ -443,28 +441,6 @@ def test_paths_out_of_the_artifacts_are_refused_in_writing_and_in_reading(tmp_pa
         list(read(tmp_path, 0, len(lines)))
 
 
-@pytest.mark.parametrize("name", ["", "a//b", "/a", "a/", "a/..", "./a", "naïve", "a=b", "a" * 251, "a\n"])
-def test_names_that_mlflow_refuses_are_refused_where_they_are_given(tmp_path: Path, name: str) -> None:
-    journal = Journal(tmp_path)
-    givings: list[Callable[[], None]] = [
-        lambda: journal.metrics({name: 0.0}, 0),
-        lambda: journal.params({name: ""}),
-        lambda: journal.tags({name: ""}),
-        lambda: journal.image(name, b"", 0),
-        lambda: journal.model(name, b"", 0, {}),
-        lambda: journal.model("best", b"", 0, {name: 0.0}),
-    ]
-    for give in givings:
-        with pytest.raises(ValueError, match="name"):
-            give()
-
-
-def test_a_model_has_a_plain_name(tmp_path: Path) -> None:
-    for name in ("a/b", "a.b"):
-        with pytest.raises(ValueError, match="must not contain"):
-            Journal(tmp_path).model(name, b"", 0, {})
-
-
 def test_without_its_commit_a_journal_is_found_to_have_lost_it_and_its_whole_lines_count_again(tmp_path: Path) -> None:
     Journal(tmp_path).status("RUNNING")
     assert not has_lost_commit(tmp_path)
@@ -525,13 +501,6 @@ def test_an_unknown_kind_of_record_is_named(tmp_path: Path) -> None:
 def test_a_folder_without_a_journal_has_no_commit_and_no_records(tmp_path: Path) -> None:
     assert read_commit(tmp_path) is None
     assert records(tmp_path) == []
-
-
-def test_a_plain_tracker_accepts_everything_and_remembers_nothing() -> None:
-    null = Tracker()
-    null.metrics({"?": math.inf}, -1)
-    null.load_state_dict(null.state_dict())
-    assert vars(null) == {}
 
 
 def test_the_curve_of_a_long_journal_is_some_of_its_points_with_both_ends(tmp_path: Path) -> None:

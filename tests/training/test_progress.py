@@ -1,14 +1,18 @@
 """What a person is told, and the pace of a training."""
 
 import io
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from rich.console import Console
 
 from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.training.evaluation import Episode, Evaluation
-from atlantis_exp.training.progress import Pace, Progress, Snapshot
+from atlantis_exp.training.plan import Counters
+from atlantis_exp.training.progress import Pace, Progress
+from atlantis_exp.training.recorder import Recorder
 
 
 @dataclass
@@ -61,51 +65,60 @@ def test_an_early_score_below_random_is_explained(score: float, frames: int, exp
     assert ("at 5 M frames published DQN is at 7,000 to 9,000" in text.getvalue()) == explained
 
 
-SNAPSHOT = Snapshot(
-    episode=1_013,
-    scores=[*[1_000.0] * 19, 3_000.0],
-    lengths=[790, 812],
-    epsilon=0.125,
-    steps=12_345,
-    updates=3_000,
-    steps_per_second=1_234.4,
-    phase="fast",
-    steps_left=930_000.9,
-)
-
-
-def line_of(snapshot: Snapshot) -> str:
-    text = io.StringIO()
-    Progress(Console(file=text, width=300)).show(snapshot)
-    return text.getvalue()
+def line_of(
+    steps: int = 12_345,
+    left: float | None = 930_000.9,
+    pace: float = 1_234.4,
+    *,
+    episodes: int = 1_012,
+    updates: int = 3_000,
+    last_step: int | None = None,
+) -> tuple[str, float]:
+    """Return the line and the share of a training with `left` steps of its plan to come."""
+    recorder = SimpleNamespace(
+        plan=SimpleNamespace(
+            done=lambda _: 0 if left is None else steps,
+            length=steps + (left or 0),
+            epsilon_at=lambda _: 0.125,
+            phase_at=lambda _: SimpleNamespace(name="fast"),
+        ),
+        learner=SimpleNamespace(updates=updates),
+        episodes=[SimpleNamespace(length=790), SimpleNamespace(length=812)],
+        recent_scores=lambda count: [1_000.0] * (count - 1) + [3_000.0] if episodes else [],
+        _pace=SimpleNamespace(steps_per_second=pace),
+        _last_step=last_step,
+    )
+    return Recorder._line(cast("Recorder", recorder), Counters(steps=steps, episodes=episodes))
 
 
 def test_a_line_says_how_far_a_training_is() -> None:
-    assert line_of(SNAPSHOT) == (
+    assert line_of()[0] == (
         "episode 1,013  score 3,000  mean of 20 1,100  duration 812 (mean of 100 801)  epsilon 0.12  "
-        "step 12,345  updates 3,000  1,234 steps/s  phase fast  1.3%  left 0:12:33\n"
+        "step 12,345  updates 3,000  1,234 steps/s  phase fast  1.3%  left 0:12:33"
     )
 
 
 def test_the_line_of_a_first_episode_has_no_score_yet() -> None:
-    first = replace(
-        SNAPSHOT, episode=1, scores=[], lengths=[], steps=0, updates=0, steps_per_second=0.0, steps_left=None
-    )
-    assert line_of(first) == (
-        "episode 1  first episode  epsilon 0.12  step 0  updates 0  0 steps/s  phase fast  0.0%  left ?\n"
+    assert line_of(0, None, 0.0, episodes=0, updates=0) == (
+        "episode 1  first episode  epsilon 0.12  step 0  updates 0  0 steps/s  phase fast  0.0%  left ?",
+        0.0,
     )
 
 
 @pytest.mark.parametrize(
-    ("steps", "steps_left", "share"),
-    [(0, None, "0.0%"), (250, 750.0, "25.0%"), (1_000, 0.0, "100.0%"), (1_003, -3.0, "100.0%")],
+    ("steps", "left", "last_step", "share"),
+    [(0, None, None, 0.0), (250, 750.0, None, 0.25), (250, 750.0, 500, 0.5), (1_003, -3.0, None, 1.0)],
 )
-def test_the_share_is_of_all_steps_until_the_end(steps: int, steps_left: float | None, share: str) -> None:
-    assert f"  {share}  left " in line_of(replace(SNAPSHOT, steps=steps, steps_left=steps_left))
+def test_the_share_is_of_all_steps_until_the_end(
+    steps: int, left: float | None, last_step: int | None, share: float
+) -> None:
+    line, found = line_of(steps, left, last_step=last_step)
+    assert found == share
+    assert f"  {share:.1%}  left " in line
 
 
 @pytest.mark.parametrize(
-    ("steps_left", "steps_per_second", "left"),
+    ("left", "pace", "shown"),
     [
         (None, 10.0, "?"),
         (100.0, 0.0, "?"),
@@ -115,13 +128,12 @@ def test_the_share_is_of_all_steps_until_the_end(steps: int, steps_left: float |
         (864_000.0, 10.0, "24:00:00"),
     ],
 )
-def test_the_time_left_follows_from_the_pace(steps_left: float | None, steps_per_second: float, left: str) -> None:
-    line = line_of(replace(SNAPSHOT, steps_left=steps_left, steps_per_second=steps_per_second))
-    assert line.endswith(f"  left {left}\n")
+def test_the_time_left_follows_from_the_pace(left: float | None, pace: float, shown: str) -> None:
+    assert line_of(12_345, left, pace)[0].endswith(f"  left {shown}")
 
 
 def test_before_the_first_update_the_pace_says_nothing_of_the_time_left() -> None:
-    assert line_of(replace(SNAPSHOT, updates=0)).endswith("  left ?\n")
+    assert line_of(updates=0)[0].endswith("  left ?")
 
 
 @pytest.mark.parametrize(("terminal", "seconds", "at_once"), [(False, 4.0, False), (True, 0.25, True)])
@@ -132,12 +144,12 @@ def test_a_training_is_shown_a_few_times_a_second_on_a_terminal_and_now_and_then
     progress = Progress(Console(file=io.StringIO(), width=300, force_terminal=terminal))
     assert progress.is_due() == at_once
     if at_once:
-        progress.show(SNAPSHOT)
+        progress.show("episode 1", 0.5)
     clock.now += seconds - 0.125
     assert not progress.is_due()
     clock.now += 0.125
     assert progress.is_due()
-    progress.show(SNAPSHOT)
+    progress.show("episode 1", 0.5)
     assert not progress.is_due()
     progress.close()
 
