@@ -3,8 +3,11 @@
 import os
 import signal
 import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 _seen = False
 
@@ -27,6 +30,18 @@ def hold() -> None:
 def seen() -> bool:
     """Return whether a SIGINT has come since `hold`, even if its KeyboardInterrupt was swallowed."""
     return _seen
+
+
+@contextmanager
+def handled(handler: Callable[[int, FrameType | None], None], *numbers: int) -> Iterator[dict[int, Any]]:
+    """Handle signals while the block runs, in the main thread, which alone gets any; yield the handlers before."""
+    is_main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.signal(number, handler) for number in numbers if is_main}
+    try:
+        yield before
+    finally:
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
 
 
 def _leave(_: int, __: FrameType | None) -> NoReturn:

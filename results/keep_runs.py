@@ -1,4 +1,4 @@
-"""Copy finished runs, comparisons and decisions in the smallest form that `compare`, `sync` and `load_runs` read.
+"""Copy runs, evaluations, comparisons and decisions in the smallest form that `compare`, `sync` and `load_runs` read.
 
 `python results/keep_runs.py OUTPUTS TARGET` leaves out weights, films, pages, this machine's paths, and comparisons
 without a look. It keeps a point of a training's curve every 5,000 steps, with five digits, and all of the last 10,000
@@ -15,7 +15,8 @@ from typing import Any
 from atlantis_exp.runs.folder import RunFolder, all_runs
 from atlantis_exp.runs.journal import NOTE, commit_bytes
 
-RUN = ("config.json", "result.json", "artifacts/episodes.csv", "artifacts/evaluation/*.csv")
+EVALUATION = ("config.json", "result.json", "artifacts/evaluation/*.csv")
+RUN = (*EVALUATION, "artifacts/episodes.csv")
 TABLES = ("looks", "verdict", "views", "runs")
 COMPARISON = ("config.json", "looks.json", *(f"artifacts/tables/{t}.csv" for t in TABLES))
 GRID = 5_000  # steps between two points of a kept curve
@@ -23,10 +24,12 @@ WHOLE = 10_000  # steps at the end that keep every point
 
 
 def main(outputs: Path, target: Path) -> None:
-    """Copy each finished run, comparison and decision of an outputs folder, replacing those of the same name."""
+    """Copy all of an outputs folder that is finished, replacing folders of the same name."""
     for run in all_runs(outputs):
         if run.result is not None:
             keep(run, RUN, target, run.result.steps)
+    for result in sorted(outputs.glob("evaluations/*/result.json")):
+        keep(RunFolder(result.parent), EVALUATION, target)
     for looks in sorted(outputs.glob("comparisons/*/looks.json")):
         if any(json.loads(looks.read_bytes()).values()):
             keep(RunFolder(looks.parent), COMPARISON, target)

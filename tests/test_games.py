@@ -12,6 +12,7 @@ import pytest
 from atlantis_exp.build import build_game, make_emulator
 from atlantis_exp.checking import parse, to_dict
 from atlantis_exp.commands.composing import admit_plugins
+from atlantis_exp.comparison.published import Table, curves, scores
 from atlantis_exp.components import game_of, known, title_of
 from atlantis_exp.config import Config, EnvConfig
 from atlantis_exp.faults import ConfigError
@@ -240,6 +241,24 @@ def test_a_game_is_compared_by_its_own_facts_and_without_its_plugin_by_none(
         assert "logarithmic" not in page
     assert all(table["why"].startswith("group,mean") and "centre" not in table["why"] for table in tables)
     assert all(table["profile"].count("\n") == 201 and table["published_curves"] == "" for table in tables)
+
+
+@pytest.mark.parametrize(
+    ("table", "text", "reason"),
+    [
+        (scores, "name,score,capped_frames\nDQN,n/a,9\n", "pong_scores.csv, line 2: could not convert string"),
+        (scores, "name,points\nDQN,12\n", "pong_scores.csv, line 2: no column 'score'"),
+        (curves, "name,frames,mean\nDQN,12,3\n", "pong_curves.csv, line 2: no column 'frames_millions'"),
+    ],
+)
+def test_a_mistake_in_a_published_table_is_one_line(
+    table: Callable[..., Table], text: str, reason: str, tmp_path: Path
+) -> None:
+    (tmp_path / "pong.py").write_text(Path(PONG).read_text())
+    admit_plugins([str(tmp_path / "pong.py")])
+    (tmp_path / f"pong_{table.__name__}.csv").write_text(text)
+    with pytest.raises(ConfigError, match=reason):
+        table(game_of("ALE/Pong-v5"))
 
 
 @pytest.mark.usefixtures("both")

@@ -14,7 +14,7 @@ import pytest
 from atlantis_exp.comparison.published import curves
 from atlantis_exp.components import game_of
 from atlantis_exp.runs.folder import RunFolder
-from atlantis_exp.runs.journal import Metrics
+from atlantis_exp.runs.journal import Journal, Metrics
 from atlantis_exp.sessions.cards import read_card
 from benchmarks.schedule import PLAYERS, bombers, most_points
 from results import publish
@@ -159,6 +159,17 @@ def test_what_is_kept_compares_as_it_did_and_names_no_place(
     assert looks_again == looks
     assert again.keys() == tables.keys()
     assert [name for name in tables if tables[name] != again[name]] == ["skipped.csv"]
+
+
+def test_an_evaluation_is_kept_too(tmp_path: Path) -> None:
+    folder = tmp_path / "evaluations" / "again"
+    journal = Journal(folder)
+    journal.artifact("evaluation/episodes.csv", b"score")
+    journal.finish()
+    for name in ("config.json", "result.json"):
+        (folder / name).write_text("{}")
+    runpy.run_path(str(RESULTS / "keep_runs.py"))["main"](tmp_path, tmp_path / "kept")
+    assert (tmp_path / "kept/evaluations/again/artifacts/evaluation/episodes.csv").read_bytes() == b"score"
 
 
 def test_what_has_been_kept_is_kept_as_it_is(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from atlantis_exp.comparison.gather import (
     StoredRun,
     named_by,
     read_runs,
+    refuse_unknown,
 )
 from atlantis_exp.comparison.published import Row
 from atlantis_exp.components import facts_of, known
@@ -93,7 +94,7 @@ def load_runs(
         window: for score="training", the last share of the steps, as a number or a string such as "20%".
 
     Raises:
-        ConfigError: if there is no such folder, no run has a key of `where`, or the window is not a share.
+        ConfigError: if there is no such folder, an item of `runs` or a key of `where` fits no run, or `window` is wrong.
         ValueError: if points is below one, or there is no such score.
     """
     if score not in ("last", "training"):
@@ -104,6 +105,7 @@ def load_runs(
     outputs = Path(outputs)
     if not (outputs / "runs").is_dir():
         raise ConfigError(f"{outputs / 'runs'}: no such folder; load_runs takes the folder of paths.outputs")
+    refuse_unknown(outputs, _listed(runs))
     stored, patterns = read_runs(outputs, _listed(runs)), named_by(outputs, _listed(runs))
     skipped = dict(stored.skipped)
     read = list[_Parts]()

@@ -330,11 +330,12 @@ def other_players(facts: Facts) -> Iterator[str]:
 
 
 CAVEATS: Sequence[Note] = (
-    *(stands, further_answers, conditions, unusual_runs, missing_seeds, modes_found, unlike, unbalanced, moved_seeds),
+    *(stands, further_answers, conditions, unusual_runs, missing_seeds, modes_found),
+    *(mixed, unlike, unbalanced, moved_seeds),
 )
 """The notes that may change the meaning of a verdict."""
 
-NOTES: Sequence[Note] = (shares, mixed, begun, survival_and_rate, time_cap, other_players)
+NOTES: Sequence[Note] = (shares, begun, survival_and_rate, time_cap, other_players)
 """The other notes."""
 
 

@@ -6,6 +6,7 @@ from math import isnan, nan
 from typing import Any
 
 from atlantis_exp.components import Component, facts_of
+from atlantis_exp.faults import ConfigError
 from atlantis_exp.runs.files import SMALL, read_file
 
 Row = dict[str, Any]
@@ -22,24 +23,30 @@ def scores(game: Component | None) -> Table:
     of["source"] = "dqn_zoo/atari_data.py (Quan and Ostrovski 2020)"
     players = {"random player": facts.random_score, "human": facts.human_score}
     table = [{"name": name, "score": score, **of} for name, score in players.items() if not isnan(score)]
-    for row in _read(game, "scores.csv"):
-        frames = float(row.pop("capped_frames", "") or nan)
+    for row in _read(game, "scores.csv", "score", "capped_frames"):
+        frames = row.pop("capped_frames") or nan
         table.append({**row, "points_per_frame": row["score"] / frames})
     return table
 
 
 def curves(game: Component | None) -> Table:
     """Return the published learning curves, if any."""
-    return [{**row, "frames": 1e6 * float(row.pop("frames_millions"))} for row in _read(game, "curves.csv")]
+    numbers = ("frames_millions", "seeds", "mean", "low", "high")
+    return [{**row, "frames": 1e6 * row.pop("frames_millions")} for row in _read(game, "curves.csv", *numbers)]
 
 
-def _read(game: Component | None, name: str) -> Table:
+def _read(game: Component | None, name: str, *numbers: str) -> Table:
+    """Read a table of a game; `numbers` are columns of numbers, NaN if empty. Raises: ConfigError."""
     if game is None or not (path := game.data_path(name)).is_file():
         return []
-    table: Table = list(csv.DictReader(io.StringIO(read_file(path.resolve(), SMALL).decode())))
-    for row in table:
-        for key in {"score", "mean", "low", "high", "seeds"} & row.keys():
-            row[key] = float(row[key])
+    reader = csv.DictReader(io.StringIO(read_file(path.resolve(), SMALL).decode(errors="replace")))
+    table = Table()
+    try:
+        for row in reader:
+            table.append({**row, "name": row["name"], **{key: float(row[key] or nan) for key in numbers}})
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
+        reason = f"no column {error}" if isinstance(error, KeyError) else error
+        raise ConfigError(f"{path}, line {reader.line_num}: {reason}") from None
     return table
 
 

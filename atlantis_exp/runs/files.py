@@ -11,6 +11,7 @@ import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, BinaryIO, TypeVar
 
 from pydantic import Field, TypeAdapter, ValidationError
@@ -130,17 +131,15 @@ def write_file(path: Path, content: bytes) -> None:
 @contextmanager
 def whole(folder: Path) -> Iterator[Path]:
     """Yield a folder to fill, which becomes the folder of `to=` if the block succeeds. Raises: Fault for an OSError."""
-    aside = folder.with_name(folder.name + ".aside")
-    shutil.rmtree(aside, ignore_errors=True)
     try:
-        make_folder(aside)
-        yield aside
-        aside.replace(folder)
+        make_folder(folder.parent)
+        with TemporaryDirectory(prefix=".aside-", dir=folder.parent) as place:
+            make_folder(aside := Path(place) / folder.name)
+            yield aside
+            aside.replace(folder)
         _sync(folder.parent)
     except OSError as error:
         raise Fault(f"to={folder}: {error}; nothing is written; make room there, or name another folder") from error
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
 
 
 def _sync(folder: Path) -> None:

@@ -3,13 +3,12 @@
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from types import FrameType
-from typing import NoReturn
 
 from atlantis_exp.config import TrackingConfig
 from atlantis_exp.faults import Fault
+from atlantis_exp.interrupts import handled
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal, Status
 from atlantis_exp.runs.provenance import provenance
@@ -68,15 +67,6 @@ def opened(
             journal.status(*ending(None))
 
 
-@contextmanager
-def terminable() -> Iterator[None]:
+def terminable() -> AbstractContextManager[object]:
     """Turn SIGTERM into an exception; a training in the block installs its own handler."""
-
-    def end(number: int, _: FrameType | None) -> NoReturn:
-        sys.exit(128 + number)
-
-    before = signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    return handled(lambda number, _: sys.exit(128 + number), signal.SIGTERM)

@@ -68,15 +68,10 @@ class StopRequest:
     @contextmanager
     def installed(self) -> Iterator[None]:
         """Handle the signals while the block runs."""
-        signals = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
-        self._before = {number: signal.signal(number, self._receive) for number in signals}
-        if interrupts.seen():  # and was swallowed
-            self.signal = signal.SIGINT
-        try:
+        with interrupts.handled(self._receive, signal.SIGINT, signal.SIGTERM, signal.SIGUSR2) as self._before:
+            if interrupts.seen():  # and was swallowed
+                self.signal = signal.SIGINT
             yield
-        finally:
-            for number, handler in self._before.items():
-                signal.signal(number, handler)
 
     def _receive(self, number: int, _: FrameType | None) -> None:
         if self.signal is not None and number == signal.SIGINT:

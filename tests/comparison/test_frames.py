@@ -242,8 +242,8 @@ def test_what_cannot_be_read_is_named_in_a_warning_and_the_others_are_there(reco
         ((), ["env.frameskip=[2, 5]", "model=cnn"], [1, 2]),
         ("cnn", (), [1, 2]),
         ("*s2", (), [2]),
-        (["resnet", "*s1"], "model=cnn", [1]),
-        ("resnet", (), []),
+        (["cnn-uniform-s1", "*s1"], "model=cnn", [1]),
+        ("cnn", "model=resnet", []),
     ],
 )
 def test_runs_are_chosen_as_by_compare(
@@ -263,11 +263,13 @@ def test_mistakes_are_named(recorded: Recorded, tmp_path: Path) -> None:
     recorded()
     with pytest.raises(ConfigError, match=r"where=sed: no such key; did you mean 'seed'"):
         load_runs(tmp_path, where="sed=1")
+    with pytest.raises(ConfigError, match=r"runs=cmn: no such run under .*\(valid: cnn-uniform-s0"):
+        load_runs(tmp_path, runs="cmn")
 
 
 def test_frames_without_runs_have_their_columns(recorded: Recorded, tmp_path: Path) -> None:
     recorded()
-    full, empty = load_runs(tmp_path), load_runs(tmp_path, runs="nothing")
+    full, empty = load_runs(tmp_path), load_runs(tmp_path, where="seed=99")
     for name in ("evaluations", "episodes", "curves"):
         assert getattr(empty, name).columns.tolist() == getattr(full, name).columns.tolist()
         assert getattr(empty, name).empty

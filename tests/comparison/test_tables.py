@@ -151,7 +151,7 @@ def test_one_group_is_shown_without_a_verdict(compared: Callable[..., Comparison
     comparison = compared(by="optimizer")
     assert comparison.verdict == "There is one group only (adamw), so there is nothing to compare; by=KEY splits it."
     assert comparison.tables["verdict"] == []
-    assert any("mixes runs that differ in more than their seed: model.name" in note for note in comparison.notes)
+    assert any("mixes runs that differ in more than their seed: model.name" in line for line in comparison.caveats)
 
 
 def test_the_three_fair_views_stand_where_the_shortest_run_ends_and_may_disagree(
@@ -226,9 +226,9 @@ def test_runs_that_differ_in_more_than_the_question_are_named(recorded: Recorded
     recorded("model=resnet", "seed=0", "optimizer.lr=0.5", "env.size=48")
     comparison = compared_by(tmp_path)
     assert any(
-        note.startswith("cnn mixes runs") and "objective.gamma (0.99 or 0.5)" in note for note in comparison.notes
+        line.startswith("cnn mixes runs") and "objective.gamma (0.99 or 0.5)" in line for line in comparison.caveats
     )
-    (between,) = [note for note in comparison.notes if note.startswith("The groups also differ in")]
+    (between,) = [line for line in comparison.caveats if line.startswith("The groups also differ in")]
     assert "env.size (40 or 48)" in between
     assert "optimizer.lr (0.001 or 0.5)" in between
     assert "model" not in between

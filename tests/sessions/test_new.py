@@ -88,6 +88,12 @@ def test_what_is_written_is_whole_or_not_there(tmp_path: Path) -> None:
     assert [*tmp_path.iterdir()] == []
 
 
+def test_what_is_written_removes_nothing_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "new.aside").mkdir()
+    begin("model", "mynet", tmp_path / "new", CONF.parent / "examples")
+    assert {path.name for path in tmp_path.iterdir()} == {"new", "new.aside"}
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(300)  # seconds
 def test_what_is_written_is_installed_and_chosen_by_its_name(

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from atlantis_exp.faults import Fault
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import Journal, adopt
+from atlantis_exp.sessions.page import terminable
 from atlantis_exp.sessions.stopping import StopRequest, sweep_goes_on
 
 REPOSITORY = Path(__file__).parents[2]
@@ -30,6 +32,17 @@ def test_a_second_interrupt_ends_the_process_at_once() -> None:
         "with StopRequest().installed(): [signal.raise_signal(signal.SIGINT) for _ in range(2)]"
     )
     assert subprocess.run((sys.executable, "-c", code), cwd=REPOSITORY, check=False).returncode == -signal.SIGINT
+
+
+def test_outside_the_main_thread_signals_keep_their_handlers() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+
+    def handler() -> object:
+        with StopRequest().installed(), terminable():
+            return signal.getsignal(signal.SIGTERM)
+
+    with ThreadPoolExecutor() as pool:
+        assert pool.submit(handler).result() == before
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from atlantis_exp import terminal
 from atlantis_exp.build import choose_device
 from atlantis_exp.config import Config
 from atlantis_exp.faults import Fault
+from atlantis_exp.interrupts import handled
 from atlantis_exp.machine import JOB_OF, all_cores, here
 from atlantis_exp.runs.files import make_folder, no_link
 from atlantis_exp.runs.folder import OUTPUT, RunFolder, has_ended
@@ -93,14 +94,9 @@ def train_side_by_side(jobs: Sequence[Job], launcher: Launcher) -> None:
     share = min(launcher.settings.get("cores", share), here().cores)
     threads = {"OMP_NUM_THREADS": f"{share}", "MKL_NUM_THREADS": f"{share}"}
     running = _Running({**os.environ, **threads, JOB_OF: "joblib"})
-    handlers = {number: signal.signal(number, running.end) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with ThreadPoolExecutor(at_once, "job") as pool:  # waits for its jobs
-            futures = [pool.submit(_train_apart, job, running) for job in jobs]
-            wait(futures)
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+    with handled(running.end, signal.SIGINT, signal.SIGTERM), ThreadPoolExecutor(at_once, "job") as pool:
+        futures = [pool.submit(_train_apart, job, running) for job in jobs]
+        wait(futures)
     for future in futures:
         future.result()
 
