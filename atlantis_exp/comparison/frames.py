@@ -94,7 +94,7 @@ def load_runs(
         window: for score="training", the last share of the steps, as a number or a string such as "20%".
 
     Raises:
-        ConfigError: if there is no such folder, an item of `runs` or a key of `where` fits no run, or `window` is wrong.
+        ConfigError: if the folder is missing, an item of `runs` or a key of `where` fits no run, or `window` is wrong.
         ValueError: if points is below one, or there is no such score.
     """
     if score not in ("last", "training"):
