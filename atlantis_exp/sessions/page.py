@@ -3,7 +3,7 @@
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from atlantis_exp.config import TrackingConfig
@@ -67,6 +67,8 @@ def opened(
             journal.status(*ending(None))
 
 
-def terminable() -> AbstractContextManager[object]:
+@contextmanager
+def terminable() -> Iterator[None]:
     """Turn SIGTERM into an exception; a training in the block installs its own handler."""
-    return handled(lambda number, _: sys.exit(128 + number), signal.SIGTERM)
+    with handled(lambda number, _: sys.exit(128 + number), signal.SIGTERM):
+        yield
