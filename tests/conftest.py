@@ -245,6 +245,12 @@ def started() -> Iterator[Callable[[Config, Path], Trainer]]:
 
 
 @pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait less for a folder that another process holds."""
+    monkeypatch.setattr("atlantis_exp.runs.folder._HOLD_SECONDS", 0.1)
+
+
+@pytest.fixture
 def recorded(tiny: Callable[..., Config]) -> Callable[..., Path]:
     """Return a function that writes the folder of a finished training without training it.
 

@@ -72,6 +72,7 @@ def test_what_a_disk_refuses_hides_no_error(folder: RunFolder, page: Page) -> No
         fail()
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_page_that_another_process_holds_is_refused_before_anything_is_prepared(
     folder: RunFolder, page: Page
 ) -> None:

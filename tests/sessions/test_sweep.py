@@ -179,6 +179,7 @@ def test_a_sweep_says_how_many_trainings_go_on_at_a_time_and_for_how_long(
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_launchers_sweep_puts_aside_what_is_to_be_begun_anew_but_what_another_process_trains(
     tiny: Compose, recorded: Callable[..., Path], tmp_path: Path
 ) -> None:

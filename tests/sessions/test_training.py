@@ -392,6 +392,7 @@ def test_resume_must_refuses_to_start_and_resume_never_keeps_what_was_there(tiny
     assert names == [config.run_name(), f"{config.run_name()}~1"]
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_run_that_another_process_holds_is_not_touched(tiny: Compose) -> None:
     config = tiny()
     folder = RunFolder.of(config)
