@@ -35,10 +35,10 @@ run: setup  ## the repo's answer into MLflow, two short trainings, the best ship
 	@echo; echo 'the film:' outputs/evaluations/cnn_annealed-*/artifacts/best_episode.mp4; echo 'all of it in a browser: make ui'
 
 test: lint  ## lint, types and the quick tests
-	$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2 --dist loadfile
+	$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2 --dist worksteal
 
 test-all: lint  ## every test, the slow ones too
-	$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2 --dist loadfile -m ''
+	$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2 --dist worksteal -m ''
 
 test-slurm: setup  ## a sweep on a real Slurm, where Debian's slurmctld, slurmd and slurm-client are installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[slurm]'
