@@ -53,7 +53,7 @@ class CompareConfig(QuestionConfig):
     runs: list[str]  # names, starts of names or patterns; none: all
     where: list[str]  # KEY=VALUE; none: all
     at_epsilon: Probability | None  # of the evaluations; null: each run's latest
-    scores: str | None  # a CSV file in place of runs
+    scores: Annotated[str, Field(min_length=1)] | None  # a CSV file in place of runs
     columns: list[str]  # group=NAME, seed=NAME, score=NAME, of that file
     look: Literal["due", "now"]
     tracking: TrackingConfig
@@ -84,10 +84,10 @@ def margin(delta: str | float | None) -> tuple[float | None, bool]:
 
 def named(columns: Iterable[str]) -> dict[str, str]:
     """Parse the names of a table's columns for group, seed and score. Raises: ConfigError."""
-    names = dict(text.partition("=")[::2] for text in columns)
-    for key, name in names.items():
-        if key not in ("group", "seed", "score") or not name:
-            raise ConfigError(f"columns={key}={name}: write group=NAME, seed=NAME or score=NAME")
+    names: dict[str, str] = {}
+    for key, _, name in (text.partition("=") for text in columns):
+        if key not in ("group", "seed", "score") or not name or names.setdefault(key, name) != name:
+            raise ConfigError(f"columns={key}={name}: write group=NAME, seed=NAME and score=NAME, each at most once")
     return names
 
 

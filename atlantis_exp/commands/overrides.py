@@ -7,7 +7,7 @@ import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
-from difflib import SequenceMatcher
+from difflib import SequenceMatcher, get_close_matches
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -370,10 +370,14 @@ def _key(override: Override) -> str:
 
 
 def _nearest_key(key: str, keys: frozenset[str]) -> str:
-    """Suggest the nearest key of the same parent, or else of any; `lr` matches `optimizer.lr`."""
+    """Suggest the nearest key of the same parent, or else of any: for `gama` and `gamma` `objective.gamma`."""
     parent = key.rpartition(".")[0]
     siblings = {known for known in keys if parent and known.rpartition(".")[0] == parent}
-    exact = sorted(known for known in keys if known.rsplit(".", 1)[-1] == key.rsplit(".", 1)[-1])
-    if exact and not siblings:
-        return f"did you mean '{max(exact, key=lambda known: SequenceMatcher(None, key, known).ratio())}'?"
+    alike = {known: SequenceMatcher(None, key, known).ratio() for known in keys}
+    ends = {
+        known.rsplit(".", 1)[-1]: known for known in sorted(keys, key=alike.__getitem__)
+    }  # of several the most alike
+    cutoff = 0.7 if max(alike.values()) < 0.5 else 1.0
+    if not siblings and (close := get_close_matches(key.rsplit(".", 1)[-1], ends, n=1, cutoff=cutoff)):
+        return f"did you mean '{ends[close[0]]}'?"
     return nearest(key, siblings or keys)

@@ -67,6 +67,7 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("optimizer.lr=???", "optimizer.lr", "issing"),
     ("samplers.uniform.name=top_half", "samplers.uniform.oversample", "missing"),
     ("=1", "=1", "no such key"),
+    ("gama=0.9", "gama=0.9", "'objective.gamma'"),
     ("experiment=quick phase.quikc.steps=1", "phase.quikc.steps=1", "'phase.quick.steps'"),
     # options
     ("model=resnt", "model=resnt", "'resnet'"),

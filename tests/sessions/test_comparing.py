@@ -273,7 +273,7 @@ def test_what_is_asked_of_runs_is_refused_with_a_table_of_scores(word: str, tmp_
         VERB.run([f"paths.outputs={tmp_path}", f"scores={tmp_path / 's.csv'}", word])
 
 
-@pytest.mark.parametrize("columns", ["return", "score=", "points=return"])
+@pytest.mark.parametrize("columns", ["return", "score=", "points=return", "group=a,group=b"])
 def test_a_column_that_is_none_of_a_table_of_scores_is_refused(columns: str) -> None:
     with pytest.raises(ConfigError, match=r"^columns="):
         VERB.run([f"columns={columns}"])
