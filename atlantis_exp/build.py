@@ -367,7 +367,7 @@ def build_cadence(evaluation: cfg.EvaluationConfig, tracking: cfg.TrackingConfig
 
 
 def build_trainer(
-    config: cfg.Config, cores: int, folder: Path, tracker: Journal, progress: Progress, about: str = ""
+    config: cfg.Config, cores: int, folder: Path, journal: Journal, progress: Progress, about: str = ""
 ) -> Trainer:
     """Return a trainer that writes under `folder` only; `about` is part of the run's description, in markdown."""
     env = config.env
@@ -396,7 +396,7 @@ def build_trainer(
             cadence=cadence,
             learner=learner,
             memory=memory,
-            tracker=tracker,
+            journal=journal,
             progress=progress,
             play=partial(evaluator, watched),
             film=evaluator.film,

@@ -34,7 +34,7 @@ def seen() -> bool:
 
 @contextmanager
 def handled(handler: Callable[[int, FrameType | None], None], *numbers: int) -> Iterator[dict[int, Any]]:
-    """Handle signals while the block runs, in the main thread, which alone gets any; yield the handlers before."""
+    """Handle signals in the main thread while the block runs; yield the earlier handlers. Other threads get none."""
     is_main = threading.current_thread() is threading.main_thread()
     before = {number: signal.signal(number, handler) for number in numbers if is_main}
     try:

@@ -91,8 +91,8 @@ def training(tracked: bool, commit_seconds: float) -> Iterator[Measure[Turn]]:
         return journal
 
     with learning(config, tracker_of) as trainer:
-        tracker = Timed(trainer.recorder.tracker)
-        trainer.recorder.tracker = cast(Journal, tracker)
+        tracker = Timed(trainer.recorder.journal)
+        trainer.recorder.journal = cast(Journal, tracker)
         trainer.recorder.play = lambda *_: _evaluation()
         clocks = [
             time.pthread_getcpuclockid(thread.ident)

@@ -246,9 +246,11 @@ def test_a_game_is_compared_by_its_own_facts_and_without_its_plugin_by_none(
 @pytest.mark.parametrize(
     ("table", "text", "reason"),
     [
-        (scores, "name,score,capped_frames\nDQN,n/a,9\n", "pong_scores.csv, line 2: could not convert string"),
-        (scores, "name,points\nDQN,12\n", "pong_scores.csv, line 2: no column 'score'"),
-        (curves, "name,frames,mean\nDQN,12,3\n", "pong_curves.csv, line 2: no column 'frames_millions'"),
+        (scores, "name,score,capped_frames\nDQN,n/a,9\n", "pong_scores.csv, row 1: could not convert string"),
+        (scores, "name,score,capped_frames\nDQN,,9\n", "pong_scores.csv, row 1: could not convert string"),
+        (scores, "name,points\nDQN,12\n", "pong_scores.csv, row 1: no column 'score'"),
+        (scores, "name,score,capped_frames\nDQN,12,\n", "pong_scores.csv, row 1: no column 'kind'"),
+        (curves, "name,frames,mean\nDQN,12,3\n", "pong_curves.csv, row 1: no column 'frames_millions'"),
     ],
 )
 def test_a_mistake_in_a_published_table_is_one_line(

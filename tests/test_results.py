@@ -201,14 +201,13 @@ def test_a_kept_curve_has_a_point_every_5000_steps_and_its_whole_end() -> None:
     assert points == [1_000, *range(5_000, 990_001, 5_000), *range(991_000, 1_000_001, 1_000)]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("question", "looks"),
     [
         ("by=model runs=decide-7cfff86226", ("01234", "56789")),
-        ("by=model runs=decide-4ec5bdb9f5", ("0123456789",)),
-        ("by=sampler runs=decide-2e9cf34c18", ("0123456789",)),
-        ("by=sampler runs=decide-c9c6a6ffea", ("0123456789",)),
+        pytest.param("by=model runs=decide-4ec5bdb9f5", ("0123456789",), marks=pytest.mark.slow),
+        pytest.param("by=sampler runs=decide-2e9cf34c18", ("0123456789",), marks=pytest.mark.slow),
+        pytest.param("by=sampler runs=decide-c9c6a6ffea", ("0123456789",), marks=pytest.mark.slow),
     ],
 )
 def test_a_question_asked_anew_of_the_kept_runs_has_the_kept_answer(

@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Sequence
 from math import isnan, nan
 from typing import Any
 
@@ -23,7 +24,7 @@ def scores(game: Component | None) -> Table:
     of["source"] = "dqn_zoo/atari_data.py (Quan and Ostrovski 2020)"
     players = {"random player": facts.random_score, "human": facts.human_score}
     table = [{"name": name, "score": score, **of} for name, score in players.items() if not isnan(score)]
-    for row in _read(game, "scores.csv", "score", "capped_frames"):
+    for row in _read(game, "scores.csv", ("name", "kind", "protocol", "source"), ("score", "capped_frames")):
         frames = row.pop("capped_frames") or nan
         table.append({**row, "points_per_frame": row["score"] / frames})
     return table
@@ -32,21 +33,24 @@ def scores(game: Component | None) -> Table:
 def curves(game: Component | None) -> Table:
     """Return the published learning curves, if any."""
     numbers = ("frames_millions", "seeds", "mean", "low", "high")
-    return [{**row, "frames": 1e6 * row.pop("frames_millions")} for row in _read(game, "curves.csv", *numbers)]
+    return [
+        {**row, "frames": 1e6 * row.pop("frames_millions")}
+        for row in _read(game, "curves.csv", ("name", "source"), numbers)
+    ]
 
 
-def _read(game: Component | None, name: str, *numbers: str) -> Table:
-    """Read a table of a game; `numbers` are columns of numbers, NaN if empty. Raises: ConfigError."""
+def _read(game: Component | None, name: str, texts: Sequence[str], numbers: Sequence[str]) -> Table:
+    """Read columns of a game's table; empty `capped_frames` are NaN. Raises: ConfigError."""
     if game is None or not (path := game.data_path(name)).is_file():
         return []
-    reader = csv.DictReader(io.StringIO(read_file(path.resolve(), SMALL).decode(errors="replace")))
     table = Table()
     try:
-        for row in reader:
-            table.append({**row, "name": row["name"], **{key: float(row[key] or nan) for key in numbers}})
-    except (KeyError, TypeError, ValueError, csv.Error) as error:
-        reason = f"no column {error}" if isinstance(error, KeyError) else error
-        raise ConfigError(f"{path}, line {reader.line_num}: {reason}") from None
+        for row in csv.DictReader(io.StringIO(read_file(path.resolve(), SMALL).decode("utf-8-sig"))):
+            read = {key: float(row[key] or (nan if key == "capped_frames" else "")) for key in numbers}
+            table.append({**{key: row[key] or "" for key in texts}, **read})
+    except (KeyError, ValueError, csv.Error) as error:
+        reason = f"no column {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
+        raise ConfigError(f"{path}, row {len(table) + 1}: {reason}") from None
     return table
 
 

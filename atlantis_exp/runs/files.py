@@ -133,7 +133,7 @@ def whole(folder: Path) -> Iterator[Path]:
     """Yield a folder to fill, which becomes the folder of `to=` if the block succeeds. Raises: Fault for an OSError."""
     try:
         make_folder(folder.parent)
-        with TemporaryDirectory(prefix=".aside-", dir=folder.parent) as place:
+        with TemporaryDirectory(prefix=".aside-", dir=folder.parent, ignore_cleanup_errors=True) as place:
             make_folder(aside := Path(place) / folder.name)
             yield aside
             aside.replace(folder)

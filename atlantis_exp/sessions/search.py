@@ -224,7 +224,7 @@ class Trials:
                     trial.report(recorder.done.last_metrics["evaluation/mean"], seen)
                 if pruned := trial.should_prune():
                     where = f"trial {trial.number} of {self.folder.name}, at step {trainer.counters.steps:,}"
-                    recorder.tracker.tags({"pruned": where})
+                    recorder.journal.tags({"pruned": where})
             stopped = stop()
             return pruned or stopped
 

@@ -289,7 +289,7 @@ def _close(trainer: Trainer, folder: RunFolder, journal: Journal, outcome: Outco
         earlier = done.evaluated_at
         report = f"evaluated last at step {earlier:,} of {counters.steps:,} (evaluation.at_end=false):\n{report}"
     if outcome != "interrupted" and not trainer.learner.updates:
-        report = f"no update was made: training.learn_start was not reached in {counters.steps:,} steps\n{report}"
+        report = f"no update was made in {counters.steps:,} steps: see training.learn_start and learn_every\n{report}"
     result = Result(outcome, counters.steps, counts, done.last_metrics, report, earlier)
     journal.status("KILLED" if outcome == "interrupted" else "FINISHED")
     if outcome != "interrupted":  # before publishing ends, so that a server gets the result, too

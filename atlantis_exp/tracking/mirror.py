@@ -156,7 +156,7 @@ def _parent_run(folder: Path, store: Store, commit: Commit, is_primary: bool) ->
     """Publish a folder's parent if needed, and return its run."""
     parent = Path(os.path.normpath(folder / commit.parent))
     is_named = folder.parent.name not in _PARENTS and re.fullmatch(_PARENT, commit.parent)
-    if not is_named or parent.is_symlink() or not parent.exists():
+    if not is_named or parent.is_symlink() or parent.resolve().parent.name not in _PARENTS or not parent.exists():
         return None
     publish(parent, store, is_primary)
     cursor = Cursor.read(_note(parent, store, is_primary))

@@ -4,7 +4,7 @@
 """
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any, NamedTuple
 
@@ -62,13 +62,13 @@ class Diverged(Fault):
 
 @dataclass(kw_only=True, eq=False)
 class Recorder:
-    """Report a training to a tracker and a person, without influence on it."""
+    """Report a training to a journal and a person, without influence on it."""
 
     plan: Plan
     cadence: Cadence
     learner: Learner
     memory: ReplayMemory
-    tracker: Journal
+    journal: Journal
     progress: Progress
     play: Play
     film: Film
@@ -96,17 +96,17 @@ class Recorder:
     def episode(self, played: Played) -> None:
         """Record an episode, and draw the pictures of a full window."""
         self.episodes.append(played)
-        self.tracker.metrics({"score/episode": played.score, "score/length": played.length}, played.step)
+        self.journal.metrics({"score/episode": played.score, "score/length": played.length}, played.step)
         if played.episode % self.cadence.histogram_episodes == 0:
             window = self.recent_scores(self.cadence.histogram_episodes)
             title = f"training, episodes {played.episode - len(window) + 1}-{played.episode}"
             # The slider counts windows, not steps: at each position every run has a picture.
             number = played.episode // self.cadence.histogram_episodes - 1
-            self.tracker.image("score/histogram", score_histogram(window, title, self.score_range), number)
+            self.journal.image("score/histogram", score_histogram(window, title, self.score_range), number)
             ends = [each.episode if self.plan.unit == "episodes" else each.step for each in self.episodes]
             scores, plan = self.recent_scores(played.episode), self.plan
             picture = score_heatmap(ends, scores, plan.length, plan.unit, self.score_range)
-            self.tracker.image("score/heatmap", picture, number)
+            self.journal.image("score/heatmap", picture, number)
 
     def curves(self, counters: Counters) -> None:
         """Record a point of every curve. Raises: Diverged."""
@@ -123,7 +123,7 @@ class Recorder:
                 "score/best_100": max(last),
                 "score/length_mean_100": float(np.mean([played.length for played in self.episodes[-100:]])),
             }
-        self.tracker.metrics(
+        self.journal.metrics(
             {
                 **measures,
                 "actions/exploration_share": counters.random / counters.steps,
@@ -153,7 +153,13 @@ class Recorder:
         """Show the progress if due; call it after every step."""
         self._pace.tick(counters.steps)
         if self.progress.is_due():
-            self.progress.show(*self._line(counters))
+            done, length = self.plan.done(counters), self.plan.length
+            left = counters.steps * (length - done) / done if done else None
+            if left is not None and self._last_step is not None:
+                left = min(left, self._last_step - counters.steps)
+            now = self.plan.epsilon_at(counters), self.learner.updates, self._pace.steps_per_second
+            phase = self.plan.phase_at(counters).name
+            self.progress.show(*line_of(counters, self.episodes[-100:], *now, phase, left))
 
     def evaluate(self, counters: Counters, num_envs: int, has_ended: bool, stop: Stop) -> None:
         """Evaluate this step's network and keep its weights; pending if stopped. Raises: Diverged."""
@@ -178,24 +184,24 @@ class Recorder:
             return
         done.owes_evaluation = False
         metrics = evaluation.metrics()
-        self.tracker.metrics(metrics, step)
-        self.tracker.tags({"policy": evaluation.policy})
+        self.journal.metrics(metrics, step)
+        self.journal.tags({"policy": evaluation.policy})
         scores = [episode.score for episode in evaluation.episodes]
         title = f"evaluation, step {step:,}"
-        self.tracker.image("evaluation/histogram", score_histogram(scores, title, self.score_range), done.evaluations)
+        self.journal.image("evaluation/histogram", score_histogram(scores, title, self.score_range), done.evaluations)
         done.evaluations += 1
         table = evaluation_at(step)
-        self.tracker.artifact(table, evaluation.table().to_csv().encode())
-        self.tracker.artifact(table.replace(".csv", ".txt"), evaluation.report().encode())
+        self.journal.artifact(table, evaluation.table().to_csv().encode())
+        self.journal.artifact(table.replace(".csv", ".txt"), evaluation.report().encode())
         weights = to_safetensors(self.learner.evaluated.state_dict())
         results = {name: value for name, value in metrics.items() if name.startswith("evaluation/")}
-        self.tracker.model(NETWORK, weights, step, results, best=is_best)
+        self.journal.model(NETWORK, weights, step, results, best=is_best)
         if is_best:
             done.best_mean, done.best_step = evaluation.summary.mean, step
             done.best_sha256 = hashlib.sha256(weights).hexdigest()
-            self.tracker.tags({"best_evaluation": f"mean {evaluation.summary.mean:,.0f} at step {step}"})
+            self.journal.tags({"best_evaluation": f"mean {evaluation.summary.mean:,.0f} at step {step}"})
             if video is not None:
-                self.tracker.artifact(BEST_EPISODE, video)
+                self.journal.artifact(BEST_EPISODE, video)
         done.evaluated_at, done.last_report, done.last_metrics = step, evaluation.report(), metrics
         self._write_episodes()
         self._describe("running", counters)
@@ -208,7 +214,7 @@ class Recorder:
         return {
             "episodes": np.array(self.episodes).reshape(-1, len(Played._fields)),
             **asdict(self.done),
-            "tracker": self.tracker.state_dict(),
+            "tracker": self.journal.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -221,11 +227,11 @@ class Recorder:
             raise ValueError(f"the last evaluation lacks {min(missing)}")
         if self.done.last_metrics and self.done.best_mean is None:
             raise ValueError("the best mean of its evaluations is missing")
-        self.tracker.load_state_dict(state["tracker"])
+        self.journal.load_state_dict(state["tracker"])
 
     def _write_episodes(self) -> None:
         lines = [",".join(f"{value:g}" if value % 1 else f"{value:.0f}" for value in row) for row in self.episodes]
-        self.tracker.artifact(EPISODES, "\n".join([",".join(Played._fields), *lines, ""]).encode())
+        self.journal.artifact(EPISODES, "\n".join([",".join(Played._fields), *lines, ""]).encode())
 
     def _describe(self, state: str, counters: Counters) -> None:
         """Describe the run's state, progress and result in markdown."""
@@ -244,27 +250,36 @@ class Recorder:
                 f"|{' ---: |' * 10}\n| {done.evaluated_at:,} | {scores} | {reached['evaluation/epsilon']} | "
                 f"{reached['evaluation/episodes']:.0f} | {reached['actions/random_share']:.1%} |",
             ]
-        self.tracker.note("\n\n".join([*lines, self.about]))
+        self.journal.note("\n\n".join([*lines, self.about]))
 
-    def _line(self, counters: Counters) -> tuple[str, float]:
-        """Return the progress in words, and the completed share of the training, in steps."""
-        steps, done, length = counters.steps, self.plan.done(counters), self.plan.length
-        left = steps * (length - done) / done if done else None  # steps
-        if left is not None and self._last_step is not None:
-            left = min(left, self._last_step - steps)
-        share = 0.0 if left is None else steps / (steps + max(left, 0.0))
-        shown, time_left, pace = "first episode", "?", self._pace.steps_per_second
-        if scores := self.recent_scores(20):
-            lengths = [played.length for played in self.episodes[-100:]]
-            shown = (
-                f"score {scores[-1]:,.0f}  mean of 20 {np.mean(scores):,.0f}  "
-                f"duration {lengths[-1]:,} (mean of 100 {np.mean(lengths):,.0f})"
-            )
-        if left is not None and pace > 0 and self.learner.updates:
-            time_left = terminal.clock(left / pace)  # steps are faster without updates
-        line = (
-            f"episode {counters.episodes + 1:,}  {shown}  epsilon {self.plan.epsilon_at(counters):.2f}  "
-            f"step {steps:,}  updates {self.learner.updates:,}  {pace:,.0f} steps/s  "
-            f"phase {self.plan.phase_at(counters).name}  {share:.1%}  left {time_left}"
+
+def line_of(
+    counters: Counters,
+    played: Sequence[Played],
+    epsilon: float,
+    updates: int,
+    pace: float,
+    phase: str,
+    left: float | None,
+) -> tuple[str, float]:
+    """Return a training's progress in words, and its completed share.
+
+    Args:
+        played: the last 100 episodes.
+        pace: steps a second.
+        left: steps until the plan or the budget ends; None if unknown.
+    """
+    share = 0.0 if left is None else counters.steps / (counters.steps + max(left, 0.0))
+    shown, time_left = "first episode", "?"
+    if played:
+        shown = (
+            f"score {played[-1].score:,.0f}  mean of 20 {np.mean([each.score for each in played[-20:]]):,.0f}  "
+            f"duration {played[-1].length:,} (mean of 100 {np.mean([each.length for each in played]):,.0f})"
         )
-        return line, share
+    if left is not None and pace > 0 and updates:
+        time_left = terminal.clock(left / pace)  # steps are faster without updates
+    line = (
+        f"episode {counters.episodes + 1:,}  {shown}  epsilon {epsilon:.2f}  step {counters.steps:,}  "
+        f"updates {updates:,}  {pace:,.0f} steps/s  phase {phase}  {share:.1%}  left {time_left}"
+    )
+    return line, share

@@ -85,7 +85,7 @@ class Trainer:
         self._take_time()
         self.recorder.refuse_divergence()
         self.checkpoints.save(self.state_dict(), self.memory)
-        self.recorder.tracker.commit()
+        self.recorder.journal.commit()
         self._last_commit = time.monotonic()
 
     def state_dict(self) -> dict[str, Any]:

@@ -238,7 +238,7 @@ def test_scores_of_an_evaluation_before_the_last_step_are_said_to_be(
 
 def test_a_training_that_never_learned_says_so(tiny: Compose, capsys: pytest.CaptureFixture[str]) -> None:
     train(Job(tiny("training.learn_start=160", "replay.capacity=200")))
-    assert "no update was made: training.learn_start was not reached in 160 steps\n" in capsys.readouterr().out
+    assert "no update was made in 160 steps: see training.learn_start and learn_every\n" in capsys.readouterr().out
 
 
 def test_a_run_says_what_it_was_made_on(tiny: Compose) -> None:

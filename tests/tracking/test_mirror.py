@@ -55,8 +55,8 @@ def test_metrics_whose_checkpoint_could_not_be_written_are_not_shown(
             raise OSError("no space")
 
     trainer = started(tiny(), tmp_path)
-    trainer.recorder.tracker.status("RUNNING")
-    trainer.recorder.tracker.metrics({"score": 1.0}, 1)
+    trainer.recorder.journal.status("RUNNING")
+    trainer.recorder.journal.metrics({"score": 1.0}, 1)
     trainer.checkpoints = FullDisk(tmp_path / "checkpoints", "x")
     with pytest.raises(OSError, match="no space"):
         trainer.run(stop=lambda: True)
@@ -448,13 +448,17 @@ def test_a_parent_that_is_a_link_is_not_published_and_none(tmp_path: Path, store
     assert "mlflow.parentRunId" not in store.client.get_run(run_id(run)).data.tags
 
 
-@pytest.mark.parametrize("place", ["runs/a", "sweeps/a", "searches/a"])
+@pytest.mark.parametrize("place", ["runs/a", "sweeps/a", "searches/a", "linked/a"])
 @pytest.mark.timeout(60)
 def test_a_folder_under_itself_has_no_parent(tmp_path: Path, store: Store, place: str) -> None:
-    folder = tmp_path / place
+    folder = tmp_path / place.replace("linked", "runs")
     Journal(folder).status("FINISHED")
+    if place.startswith("linked"):
+        (tmp_path / "sweeps").symlink_to("runs")
     commit = folder / "commit.json"
-    commit.write_bytes(commit.read_bytes().replace(b'"parent":""', f'"parent":"../../{place}"'.encode()))
+    commit.write_bytes(
+        commit.read_bytes().replace(b'"parent":""', f'"parent":"../../{place.replace("linked", "sweeps")}"'.encode())
+    )
     publish(folder, store)
     assert "mlflow.parentRunId" not in store.client.get_run(run_id(folder)).data.tags
 

@@ -248,7 +248,7 @@ def test_a_publisher_that_nobody_waits_for_tries_less_and_less_often(
     monkeypatch.setattr(publishing, "publish", fail)
     publisher = Publisher(tmp_path, Store(tmp_path), interval=120)
     assert not publisher.drain(0.5)  # one try at once, one in a second
-    tries = list(takewhile(bool, (tried.acquire(timeout=1.5) for _ in range(9))))
+    tries = list(takewhile(bool, (tried.acquire(timeout=3) for _ in range(9))))
     assert 2 <= len(tries) <= 3
     monkeypatch.setattr(publishing, "publish", lambda *_: None)
     assert publisher.drain(30)  # wakes it

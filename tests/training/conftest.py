@@ -209,7 +209,7 @@ def small() -> Callable[..., Trainer]:
                 cadence=cadence,
                 learner=learner,
                 memory=memory,
-                tracker=Journal(folder),
+                journal=Journal(folder),
                 progress=Progress(console or Console(quiet=True)),
                 play=partial(evaluator, watched),
                 film=evaluator.film,

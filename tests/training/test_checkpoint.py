@@ -284,7 +284,7 @@ def die_in_commit(trainer: Trainer, folder: Path, operation: int) -> bool:
 
 def _commit_and_die(trainer: Trainer, folder: Path, operation: int) -> None:
     trainer.checkpoints.folder = folder / "checkpoints"
-    trainer.recorder.tracker._folder = folder
+    trainer.recorder.journal._folder = folder
     count = 0
 
     def tick(event: str, _: object = None) -> None:

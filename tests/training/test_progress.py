@@ -1,9 +1,8 @@
 """What a person is told, and the pace of a training."""
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import cast
 
 import pytest
 from rich.console import Console
@@ -12,7 +11,7 @@ from atlantis_exp.components import facts_of, game_of
 from atlantis_exp.training.evaluation import Episode, Evaluation
 from atlantis_exp.training.plan import Counters
 from atlantis_exp.training.progress import Pace, Progress
-from atlantis_exp.training.recorder import Recorder
+from atlantis_exp.training.recorder import Played, line_of
 
 
 @dataclass
@@ -65,54 +64,40 @@ def test_an_early_score_below_random_is_explained(score: float, frames: int, exp
     assert ("at 5 M frames published DQN is at 7,000 to 9,000" in text.getvalue()) == explained
 
 
-def line_of(
+PLAYED = [Played(1, 9, 27, score, length, 0) for score, length in [(1_000.0, 789)] * 19 + [(3_000.0, 812)]]
+
+
+def said(
     steps: int = 12_345,
     left: float | None = 930_000.9,
     pace: float = 1_234.4,
     *,
-    episodes: int = 1_012,
+    played: Sequence[Played] = PLAYED,
     updates: int = 3_000,
-    last_step: int | None = None,
 ) -> tuple[str, float]:
-    """Return the line and the share of a training with `left` steps of its plan to come."""
-    recorder = SimpleNamespace(
-        plan=SimpleNamespace(
-            done=lambda _: 0 if left is None else steps,
-            length=steps + (left or 0),
-            epsilon_at=lambda _: 0.125,
-            phase_at=lambda _: SimpleNamespace(name="fast"),
-        ),
-        learner=SimpleNamespace(updates=updates),
-        episodes=[SimpleNamespace(length=790), SimpleNamespace(length=812)],
-        recent_scores=lambda count: [1_000.0] * (count - 1) + [3_000.0] if episodes else [],
-        _pace=SimpleNamespace(steps_per_second=pace),
-        _last_step=last_step,
-    )
-    return Recorder._line(cast("Recorder", recorder), Counters(steps=steps, episodes=episodes))
+    counters = Counters(steps=steps, episodes=1_012 if played else 0)
+    return line_of(counters, played, 0.125, updates, pace, "fast", left)
 
 
 def test_a_line_says_how_far_a_training_is() -> None:
-    assert line_of()[0] == (
-        "episode 1,013  score 3,000  mean of 20 1,100  duration 812 (mean of 100 801)  epsilon 0.12  "
+    assert said()[0] == (
+        "episode 1,013  score 3,000  mean of 20 1,100  duration 812 (mean of 100 790)  epsilon 0.12  "
         "step 12,345  updates 3,000  1,234 steps/s  phase fast  1.3%  left 0:12:33"
     )
 
 
 def test_the_line_of_a_first_episode_has_no_score_yet() -> None:
-    assert line_of(0, None, 0.0, episodes=0, updates=0) == (
+    assert said(0, None, 0.0, played=[], updates=0) == (
         "episode 1  first episode  epsilon 0.12  step 0  updates 0  0 steps/s  phase fast  0.0%  left ?",
         0.0,
     )
 
 
 @pytest.mark.parametrize(
-    ("steps", "left", "last_step", "share"),
-    [(0, None, None, 0.0), (250, 750.0, None, 0.25), (250, 750.0, 500, 0.5), (1_003, -3.0, None, 1.0)],
+    ("steps", "left", "share"), [(0, None, 0.0), (250, 750.0, 0.25), (1_000, 0.0, 1.0), (1_003, -3.0, 1.0)]
 )
-def test_the_share_is_of_all_steps_until_the_end(
-    steps: int, left: float | None, last_step: int | None, share: float
-) -> None:
-    line, found = line_of(steps, left, last_step=last_step)
+def test_the_share_is_of_all_steps_until_the_end(steps: int, left: float | None, share: float) -> None:
+    line, found = said(steps, left)
     assert found == share
     assert f"  {share:.1%}  left " in line
 
@@ -129,11 +114,11 @@ def test_the_share_is_of_all_steps_until_the_end(
     ],
 )
 def test_the_time_left_follows_from_the_pace(left: float | None, pace: float, shown: str) -> None:
-    assert line_of(12_345, left, pace)[0].endswith(f"  left {shown}")
+    assert said(12_345, left, pace)[0].endswith(f"  left {shown}")
 
 
 def test_before_the_first_update_the_pace_says_nothing_of_the_time_left() -> None:
-    assert line_of(updates=0)[0].endswith("  left ?")
+    assert said(updates=0)[0].endswith("  left ?")
 
 
 @pytest.mark.parametrize(("terminal", "seconds", "at_once"), [(False, 4.0, False), (True, 0.25, True)])
