@@ -1,6 +1,7 @@
 """Read the environment of a process: its cores and its launcher."""
 
 import os
+import re
 from dataclasses import dataclass
 
 JOB_OF = "ATLANTIS_EXP_JOB_OF"
@@ -24,9 +25,14 @@ def all_cores() -> int:
 def here() -> Machine:
     """Read this process's environment; OMP_NUM_THREADS limits its cores, as for torch, Slurm and launchers."""
     cores = all_cores()
-    share, restarts = os.environ.get("OMP_NUM_THREADS", ""), os.environ.get("SLURM_RESTART_COUNT", "0")
     return Machine(
-        cores=min(cores, int(share)) if share.isdecimal() and int(share) else cores,
+        cores=min(cores, _count("OMP_NUM_THREADS") or cores),
         launcher=os.environ.get(JOB_OF),
-        slurm_restarts=int(restarts) if "SLURM_JOB_ID" in os.environ else None,
+        slurm_restarts=_count("SLURM_RESTART_COUNT") if "SLURM_JOB_ID" in os.environ else None,
     )
+
+
+def _count(variable: str) -> int:
+    """Return an environment variable's number; 0 if it has none."""
+    text = os.environ.get(variable, "")
+    return int(text) if re.fullmatch(r"\d{1,6}", text) else 0

@@ -71,6 +71,8 @@ def _split(words: list[str]) -> tuple[str, list[str]]:
     from atlantis_exp import terminal
 
     terminal.guard()
+    if words and words[0] in ("--help", "-h") and {*words[1:2]} & VERBS.keys():
+        words = [words[1], words[0], *words[2:]]
     first, *rest = words or [""]
     if first in VERBS:
         verb, arguments = first, rest

@@ -129,7 +129,9 @@ def check(config_name: str, schema: type[T], arguments: Sequence[str]) -> dict[t
         return {((f"--config-dir={own}", *job) if own else job): config for job, config in configs.items()}
     except (HydraException, OmegaConfBaseException) as error:
         reason = f": {error.__cause__}" if isinstance(error.__cause__, OmegaConfBaseException) else ""
-        raise ConfigError(" ".join(re.split("Config search path|full_key:", f"{error}{reason}")[0].split())) from None
+        text = " ".join(re.split("Config search path|full_key:", f"{error}{reason}")[0].split())
+        key = getattr(error, "full_key", None)  # of a value that refers to another
+        raise ConfigError(f"{key}: {text}" if key and key not in text else text) from None
     except (YAMLError, ValueError, TypeError, RecursionError) as error:  # Hydra and OmegaConf do not check their files
         if own is None or isinstance(error, ConfigError):
             raise
@@ -278,7 +280,7 @@ def is_longer(values: RangeSweep, most: int) -> bool:
     """Tell whether a range has more numbers than `most`; False for step 0, which fails later."""
     assert values.start is not None
     assert values.stop is not None
-    return values.step != 0 and abs(values.stop - values.start) > most * abs(values.step)
+    return values.step != 0 and not abs(values.stop - values.start) <= most * abs(values.step)  # NaN counts as long
 
 
 def _check_job(config_name: str, schema: type[T], texts: Sequence[str], own: Path | None) -> T:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 
-from hydra.core.override_parser.types import Glob, IntervalSweep, RangeSweep
+from hydra.core.override_parser.types import ChoiceSweep, Glob, IntervalSweep, RangeSweep
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
 from atlantis_exp.commands.app import Asked
@@ -48,6 +48,8 @@ def _read(key: str, text: str, closed: set[str]) -> Distribution:
                 raise ValueError("has no numbers")
             low, high, step = min(numbers[0], numbers[-1]), max(numbers[0], numbers[-1]), abs(values.step)
         else:
+            assert isinstance(values, ChoiceSweep)
+            values.shuffle = False  # else each call would have another order, and be another search
             return CategoricalDistribution(list(dict.fromkeys(override.sweep_string_iterator())))
         is_log = "log" in values.tags
         if isinstance(low, int) and isinstance(high, int):

@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import select
 import signal
+import sys
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
@@ -12,6 +13,7 @@ from contextlib import contextmanager, suppress
 from ctypes import Array, c_ubyte
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
+from types import ModuleType
 from typing import Any, NamedTuple, Self, final
 
 import cv2
@@ -172,7 +174,7 @@ class ProcessEmulators(Emulators):
         self._polls: list[select.poll] = []  # connection.poll would take as long as a step
         cores = _cores_for(workers)
         atexit.register(self.close)  # at exit multiprocessing waits for its SIGTERM, which workers ignore
-        with _signals_held():
+        with _signals_held(), _without_main():
             for worker, envs in enumerate(self._envs):
                 connection, theirs = context.Pipe()
                 core = cores[worker % len(cores)] if cores else None
@@ -246,6 +248,16 @@ def _signals_held() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """Hide the main module, which a new process would run again: a script that trains would train there, too."""
+    main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def _row(emulator: Emulator) -> np.dtype[np.void]:

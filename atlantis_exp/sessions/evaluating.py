@@ -28,6 +28,7 @@ from atlantis_exp.runs.folder import BEST_EPISODE, EVALUATION, EVALUATION_REPORT
 from atlantis_exp.runs.provenance import provenance
 from atlantis_exp.sessions.cards import build_exported_actor, read_card, side_by_side
 from atlantis_exp.sessions.job import config_colour, labels
+from atlantis_exp.sessions.page import terminable
 from atlantis_exp.sessions.processor import set_up_torch
 from atlantis_exp.sessions.weights import stored_weights
 from atlantis_exp.sessions.window import Window
@@ -170,7 +171,7 @@ def _facts(**parts: Any) -> dict[str, Any]:
 def _held(folder: RunFolder) -> Iterator[None]:
     """Hold a run's folder while a game is played; remove a new one if nothing was recorded."""
     is_new = not folder.path.exists()
-    with folder.held():
+    with terminable(), folder.held():
         try:
             yield
         finally:

@@ -44,7 +44,7 @@ def export(
     catch_up(outputs)
     source = find_run(outputs, run)
     typed = Path(to or f"pretrained/{source.name}")
-    folder = absolute("to", str(typed))
+    folder = absolute("to", str(typed)).resolve()
     if folder == Path.cwd():  # the export takes its place, and a shell would be left in none
         raise ConfigError(f"to={to}: the folder that you are in; name another")
     check_new(folder)

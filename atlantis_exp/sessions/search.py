@@ -11,7 +11,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from optuna.samplers import TPESampler
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
 from optuna.trial import FrozenTrial, TrialState
+from pydantic import FiniteFloat
 from rich.table import Table
 
 from atlantis_exp import terminal
@@ -33,7 +34,7 @@ from atlantis_exp.checking import digest
 from atlantis_exp.comparison.decision import mean_interval
 from atlantis_exp.faults import ConfigError, Fault
 from atlantis_exp.media import run_colour
-from atlantis_exp.runs.files import ARTIFACT, own, read_file
+from atlantis_exp.runs.files import ARTIFACT, checked, own, read_file
 from atlantis_exp.runs.folder import RunFolder
 from atlantis_exp.runs.journal import NOTE_LENGTH, Journal, Metrics, Status, adopt
 from atlantis_exp.runs.lock import alone
@@ -262,7 +263,7 @@ class Trials:
                 shared = _without(asked.overrides, "seed", "resume", "budget.wall_clock")
                 against = f"against={','.join(_values(best))}"
                 lines.append(f"Better than the default? {command_line('decide', *shared, against)}")
-        full = _without(job.overrides, "budget.steps", "budget.flops", "budget.wall_clock")
+        full = _without(job.overrides, "resume", "budget.steps", "budget.flops", "budget.wall_clock")
         return [*lines, f"The best in full: {command_line(*full)}"]
 
     def describe(self, journal: Journal) -> None:
@@ -311,13 +312,16 @@ def _study(file: Path, asked: Search) -> Study:
                 os.truncate(file, read_file(file, ARTIFACT).rfind(b"\n") + 1)
             finally:
                 lock.release()
-        return optuna.create_study(
+        study = optuna.create_study(
             storage=JournalStorage(JournalFileBackend(str(file))),
             study_name=file.parent.name,
             direction="maximize",
             pruner=NopPruner() if after is None else MedianPruner(after, asked.spared + 1),
             load_if_exists=True,
         )
+        for trial in study.get_trials(deepcopy=False):
+            _check(trial, asked.space)
+        return study
     except OSError:
         raise
     except Exception as error:  # Optuna does not check its file
@@ -326,6 +330,28 @@ def _study(file: Path, asked: Search) -> Study:
             f"{file} is damaged ({reason}): restore it, or start a search with another name=, which reuses runs of "
             "the same values"
         ) from None
+
+
+@dataclass(frozen=True)
+class _Told:
+    """A trial's result, as far as it has one."""
+
+    value: FiniteFloat | None
+    scores: list[FiniteFloat] = field(default_factory=list)
+    runs: list[str] = field(default_factory=list)
+    error: str = ""
+
+
+def _check(trial: FrozenTrial, space: Mapping[str, BaseDistribution]) -> None:
+    """Raise an error for a trial that no search of this space has recorded."""
+    told, state = checked(_Told, {**trial.user_attrs, "value": trial.value}), trial.state
+    has_ended = {
+        TrialState.COMPLETE: told.value is not None and bool(told.scores and told.runs),
+        TrialState.PRUNED: told.value is not None,
+        TrialState.FAIL: bool(told.error),
+    }.get(state, True)
+    if not (has_ended and trial.distributions.items() <= space.items()):
+        raise ValueError(f"trial {trial.number} lacks its result, or is of another space")
 
 
 def _interval(scores: Sequence[float]) -> str:

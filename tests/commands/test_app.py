@@ -84,6 +84,8 @@ def test_help_says_what_a_verb_does_and_without_one_which_there_are(
     assert first == f"python -m atlantis_exp {verb or '[VERB]'} KEY=VALUE ..."
     if verb:
         assert second == VERBS[verb]
+        assert command("--help", verb) == 0
+        assert capfd.readouterr().out.splitlines() == [first, second, *others]
     else:
         assert all(any(purpose in line for line in others) for purpose in VERBS.values())
     assert list(tmp_path.iterdir()) == []

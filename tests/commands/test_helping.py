@@ -68,7 +68,7 @@ def test_help_and_a_misspelt_verb_load_nothing_heavy() -> None:
         "& {*sys.modules}), file=sys.stderr)); "
         "from atlantis_exp.commands import main; main()"
     )
-    for words in (["--help"], ["compare", "--help"], ["trian"]):
+    for words in (["--help"], ["compare", "--help"], ["--help", "compare"], ["trian"]):
         done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True, check=False)
         assert done.stderr.splitlines()[-1] == "[]", words
 

@@ -65,6 +65,8 @@ MISTAKES = [  # what is written, and what the one line must hold
     ("phase=two_phase ~phase.first.lr", "phase.first.lr", "missing"),
     ("optimizer.lr=${optimizer.l}", "optimizer.l", "'optimizer.lr'"),
     ("optimizer.lr=???", "optimizer.lr", "issing"),
+    ("seed=${oc.env:NOWHERE}", "seed: ", "NOWHERE"),
+    ("-m seed=range(nan,5)", "seed", "more than"),
     ("samplers.uniform.name=top_half", "samplers.uniform.oversample", "missing"),
     ("=1", "=1", "no such key"),
     ("gama=0.9", "gama=0.9", "'objective.gamma'"),

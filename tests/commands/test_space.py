@@ -26,6 +26,7 @@ from atlantis_exp.commands.space import check_space, read_space
     [
         ("choice(adam, rmsprop)", CategoricalDistribution(["adam", "rmsprop"])),
         ("adam,rmsprop,adam", CategoricalDistribution(["adam", "rmsprop"])),
+        ("shuffle(5,4,3,2,1,0)", CategoricalDistribution([*"543210"])),
         ("choice([1,2],[3,4])", CategoricalDistribution(["[1,2]", "[3,4]"])),
         ("interval(1, 5)", FloatDistribution(1.0, 5.0)),
         ("tag(log, interval(1e-5, 1e-3))", FloatDistribution(1e-5, 1e-3, log=True)),

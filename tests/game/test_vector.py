@@ -293,6 +293,13 @@ def test_workers_and_their_memory_do_not_outlive_a_killed_parent(busy: str) -> N
     assert set(os.listdir("/dev/shm")) <= shared_before
 
 
+def test_a_script_is_not_run_again_in_the_workers(tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(f"print('once')\n{PARENT}")
+    ran = subprocess.run([sys.executable, tmp_path / "script.py"], capture_output=True, check=True, timeout=60)
+    assert ran.stdout.count(b"once") == 1
+    assert ran.stderr == b""
+
+
 def test_a_parent_that_forgets_to_close_ends_in_silence() -> None:
     told = subprocess.run([sys.executable, "-c", PARENT], capture_output=True, check=True, timeout=60)
     assert told.stderr == b""

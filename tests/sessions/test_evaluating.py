@@ -7,6 +7,7 @@ import csv
 import json
 import re
 import shutil
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -136,6 +137,14 @@ def test_a_held_button_scores_2000_and_the_run_holds_its_report_table_picture_an
 def test_an_evaluation_can_come_back_from_a_server_whatever_the_weights_are_called(name: str) -> None:
     assert re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.,~+=@-]{0,199}", f"{_placeable(name)}-at-{10**12}-0a1b2c")
     assert _placeable("cnn-uniform-s0-aa~1") == "cnn-uniform-s0-aa~1"
+
+
+def test_a_baseline_that_is_terminated_leaves_nothing(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(evaluating, "build_evaluator", lambda *_: signal.raise_signal(signal.SIGTERM))
+    assert command("baseline", "tracking=none", f"paths.outputs={tmp_path}") == 143
+    assert not [*tmp_path.glob("runs/*")]
 
 
 @pytest.mark.usefixtures("pygame")

@@ -67,6 +67,9 @@ def test_an_exports_folder_is_typed_as_in_a_shell_and_is_not_the_one_that_it_is_
     shared = (f"paths.outputs={trained}", "device=cpu", "episodes=1")
     assert command("export", "to=.", *shared) == 2
     assert capsys.readouterr().err == "atlantis_exp: to=.: the folder that you are in; name another\n"
+    assert command("export", "to=x/..", *shared) == 2
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "here").symlink_to("empty")
     assert command("export", "to='~/here'", *shared) == 0
     assert (tmp_path / "here" / "card.json").exists()
     assert command("evaluate", "weights='~/here'", *shared, "tracking=none") == 0

@@ -1,6 +1,7 @@
 """A search with real trainings: in one process, in several, and through every way to end one."""
 
 import dataclasses
+import json
 import math
 import os
 import re
@@ -71,7 +72,7 @@ def job_of(trials: Trials, number: int) -> Job:
 def test_a_search_trains_its_trials_under_a_run_of_its_own_and_goes_on_where_more_are_asked_for(
     searching: Searching, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    request = searching("trials=1")
+    request = searching("trials=1", "resume=auto")
     search(request)
     (first,) = tmp_path.glob("runs/*/result.json")
     trained = first.stat().st_mtime_ns
@@ -82,6 +83,7 @@ def test_a_search_trains_its_trials_under_a_run_of_its_own_and_goes_on_where_mor
     assert len(list(tmp_path.glob("runs/*/result.json"))) == 2
     assert "trial 1: optimizer=" in printed
     assert f"The best in full: python -m atlantis_exp {request.overrides[0]}" in printed
+    assert "resume" not in printed.partition("The best in full")[2]
 
     trials = Trials(request)
     (best, scores), (other, _) = trials.ranking
@@ -164,6 +166,33 @@ def test_a_damaged_record_of_the_trials_is_one_line_and_loses_no_other_line(sear
         Trials(trials.asked)
     assert "\n" not in str(fault.value)
     assert file.read_bytes().startswith(content)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"scores": [', '"scored": ['),
+        ('"runs": ["', '"runs": [1, "'),
+        ('"values": [', '"values": [1.0, '),
+        ('"state": 1, "values": [', '"state": 3, "values": ['),
+        ("optimizer.lr", "optimizer.eps"),
+    ],
+)
+def test_a_forged_trial_is_one_line(searching: Searching, old: str, new: str) -> None:
+    trials = trials_of(searching, "trials=1")
+    with trials.claimed() as trial:
+        assert trial is not None
+        trial.set_user_attr("runs", ["cnn"])
+        trial.set_user_attr("scores", [1.0])
+        trials.study.tell(trial, 1.0)
+    assert Trials(trials.asked).ranking
+    file = trials.folder.path / "trials.jsonl"
+    content = json.dumps([json.loads(line) for line in file.read_text().splitlines()])
+    assert old in content
+    lines = json.loads(content.replace(old, new))
+    file.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    with pytest.raises(Fault, match=f"{file} is damaged"):
+        Trials(trials.asked)
 
 
 def test_a_record_of_the_trials_that_is_a_link_or_a_pipe_is_one_line(searching: Searching, tmp_path: Path) -> None:
