@@ -348,7 +348,7 @@ def _check(trial: FrozenTrial, space: Mapping[str, BaseDistribution]) -> None:
     has_ended = {
         TrialState.COMPLETE: told.value is not None and bool(told.scores and told.runs),
         TrialState.PRUNED: told.value is not None,
-        TrialState.FAIL: bool(told.error),
+        TrialState.FAIL: "error" in trial.user_attrs,
     }.get(state, True)
     if not (has_ended and trial.distributions.items() <= space.items()):
         raise ValueError(f"trial {trial.number} lacks its result, or is of another space")
