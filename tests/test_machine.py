@@ -7,7 +7,7 @@ import pytest
 from atlantis_exp.machine import JOB_OF, Machine, here
 
 
-@pytest.mark.parametrize(("share", "cores"), [("2", 2), ("64", 3), ("", 3), ("0", 3), ("two", 3)])
+@pytest.mark.parametrize(("share", "cores"), [("2", 2), ("64", 3), ("", 3), ("0", 3), ("two", 3), ("9" * 5_000, 3)])
 def test_a_process_has_the_cores_it_may_run_on_and_of_these_its_share(
     monkeypatch: pytest.MonkeyPatch, share: str, cores: int
 ) -> None:
@@ -34,3 +34,5 @@ def test_a_process_knows_the_launcher_that_has_started_it(monkeypatch: pytest.Mo
     assert here() == Machine(cores, "apart", 0)
     monkeypatch.setenv("SLURM_RESTART_COUNT", "2")
     assert here() == Machine(cores, "apart", 2)
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "abc")
+    assert here() == Machine(cores, "apart", 0)

@@ -376,9 +376,7 @@ def _nearest_key(key: str, keys: frozenset[str]) -> str:
     parent = key.rpartition(".")[0]
     siblings = {known for known in keys if parent and known.rpartition(".")[0] == parent}
     alike = {known: SequenceMatcher(None, key, known).ratio() for known in keys}
-    ends = {
-        known.rsplit(".", 1)[-1]: known for known in sorted(keys, key=alike.__getitem__)
-    }  # of several the most alike
+    ends = {known.rsplit(".", 1)[-1]: known for known in sorted(keys, key=alike.__getitem__)}  # the last, most alike
     cutoff = 0.7 if max(alike.values()) < 0.5 else 1.0
     if not siblings and (close := get_close_matches(key.rsplit(".", 1)[-1], ends, n=1, cutoff=cutoff)):
         return f"did you mean '{ends[close[0]]}'?"

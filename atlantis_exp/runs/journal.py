@@ -161,7 +161,7 @@ class Journal:
     def metrics(self, values: Mapping[str, float], step: int) -> None:
         """Record values measured at a step."""
         self._time = max(self._time, _now())
-        self._append(Metrics(step, self._time, {key: float(value) for key, value in values.items()}))
+        self._append(Metrics(step, self._time, _numbers(values)))
 
     def params(self, values: Mapping[str, str]) -> None:
         """Record the settings of the run."""
@@ -192,9 +192,7 @@ class Journal:
         path = model_file(name, step)
         digest = self._write(path, content)
         # MLflow charts a model's metrics on the run, too: with the time of the last metrics they coincide.
-        self._append(
-            Model(name, step, self._time, path, {key: float(value) for key, value in metrics.items()}, best, digest)
-        )
+        self._append(Model(name, step, self._time, path, _numbers(metrics), best, digest))
 
     def status(self, status: Status, error: str = "") -> None:
         """Make the run's state and the reason of a failure visible, but no records."""
@@ -379,6 +377,10 @@ def _line(file: BinaryIO, start: int, end: int) -> bytes:
     if len(line) == SMALL:
         raise ValueError(f"{file.name} has a line of more than {SMALL:,} bytes at byte {start}")
     raise ValueError(f"{file.name} ends at byte {start + len(line)}, before its commit at {end}")
+
+
+def _numbers(values: Mapping[str, float]) -> dict[str, float]:
+    return {key: float(value) for key, value in values.items()}
 
 
 def _new_commit() -> Commit:

@@ -146,6 +146,18 @@ def test_a_line_says_how_the_training_stands(small: Small, tmp_path: Path, monke
     assert "  phase quick  62.5%  left " in lines[-1]
 
 
+def test_the_share_of_a_training_is_of_the_steps_until_its_budget_ends(
+    small: Small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = io.StringIO()
+    trainer = small(tmp_path, console=Console(file=told, width=300), evaluate_steps=None)
+    monkeypatch.setattr(trainer.recorder.progress, "is_due", lambda: True)
+    trainer.recorder.begin(trainer.counters, last_step=80)
+    trainer.counters.steps = 40
+    trainer.recorder.show(trainer.counters)
+    assert "  phase quick  50.0%  left " in told.getvalue()
+
+
 def test_every_number_of_an_evaluation_is_said_at_one_step_and_the_last_ones_is_where_the_run_ended(
     small: Small, tmp_path: Path
 ) -> None:
